@@ -1,0 +1,15 @@
+"""Environments: formations, maps, rewards and the VMAS scenario made of them."""
+
+from redig.envs.formations import FORMATIONS, formation_integrity, formation_offsets, pairwise_distances
+from redig.envs.maps import ObstacleMap, corridor
+from redig.envs.navigation import FormationNavigation
+
+__all__ = [
+    "FORMATIONS",
+    "FormationNavigation",
+    "ObstacleMap",
+    "corridor",
+    "formation_integrity",
+    "formation_offsets",
+    "pairwise_distances",
+]

@@ -1,0 +1,69 @@
+"""How a velocity command becomes motion: within a speed limit and an acceleration limit, and never through a wall."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+from vmas.simulator.dynamics.common import Dynamics
+
+
+class VelocityCommand(Dynamics):
+    """Robot that takes velocity commands (m/s) and follows them as fast as its acceleration limit allows.
+
+    The command is shortened to ``max_speed``; the force that reaches it within one step is limited by VMAS to the
+    agent's ``max_f``, which for a mass of 1 kg is the acceleration limit in m/s².
+
+    Args:
+        dt: time step (s).
+        max_speed: limit on the norm of the command (m/s).
+    """
+
+    def __init__(self, dt: float, max_speed: float) -> None:
+        super().__init__()
+        self.dt = dt
+        self.max_speed = max_speed
+
+    @property
+    def needed_action_size(self) -> int:
+        """Two: the command along x and y."""
+        return 2
+
+    def process_action(self) -> None:
+        """Turn the command of the agent into a force."""
+        command = limit_norm(self.agent.action.u[:, :2], self.max_speed)
+        self.agent.state.force = self.agent.mass * (command - self.agent.state.vel) / self.dt
+
+
+def limit_norm(vector: Tensor, limit: float) -> Tensor:
+    """Shorten vectors ``[*B, 2]`` to a norm of at most ``limit``, keeping their direction.
+
+    Examples:
+        >>> import torch
+        >>> limit_norm(torch.tensor([3.0, 4.0]), 1.0)
+        tensor([0.6000, 0.8000])
+    """
+    return vector * (limit / vector.norm(dim=-1, keepdim=True).clamp_min(limit))
+
+
+def separate(position: Tensor, velocity: Tensor, radius: float, distance: Tensor, direction: Tensor) -> tuple[Tensor, Tensor]:
+    """Push robots out of walls and out of each other, and stop their motion into a wall (rigid, inelastic contact).
+
+    Args:
+        position: ``[*B, n, 2]`` (m).
+        velocity: ``[*B, n, 2]`` (m/s).
+        radius: of a robot (m).
+        distance: signed distance to the nearest obstacle ``[*B, n]`` (m).
+        direction: unit vector to it ``[*B, n, 2]``.
+
+    Returns:
+        position and velocity after the contact, shapes as given.
+    """
+    n = position.shape[-2]
+    relative = position.unsqueeze(-2) - position.unsqueeze(-3)  # [*B, n, n, 2], from j to i
+    gap = relative.norm(dim=-1, keepdim=True)
+    myself = torch.eye(n, dtype=torch.bool, device=position.device).unsqueeze(-1)
+    overlap = (2 * radius - gap).clamp_min(0).masked_fill(myself, 0)
+    push = (relative / gap.clamp_min(1e-6) * overlap / 2).sum(-2)
+    into_wall = (radius - distance).clamp_min(0).unsqueeze(-1)
+    inward = (velocity * direction).sum(-1, keepdim=True).clamp_min(0) * (into_wall > 0)
+    return position + push - direction * into_wall, velocity - direction * inward

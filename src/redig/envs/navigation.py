@@ -1,0 +1,276 @@
+"""Formation navigation through a map: a VMAS scenario in one file, used through TorchRL's ``VmasEnv``."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+from vmas.simulator.core import Agent, Sphere, World
+from vmas.simulator.scenario import BaseScenario
+
+from redig.envs import rewards
+from redig.envs.dynamics import VelocityCommand, separate
+from redig.envs.formations import formation_offsets, pairwise_distances
+from redig.envs.maps import ObstacleMap, corridor
+
+FORMATION_REWARDS = ("spring_damper", "spring_damper_bonus", "scaled", "none")
+NAVIGATION_REWARDS = ("goal_speed", "progress")
+
+
+class FormationNavigation(BaseScenario):
+    """A team crosses a map in formation: from a formation on one side to the same formation on the other.
+
+    The defaults are the paper's (Eq. 29 and 30, with the corrections of ``docs/paper.md``); recipes state what they
+    change. All quantities of a step are computed once for the whole team after the physics step, so rewards do not
+    depend on the order in which VMAS asks for them.
+
+    Keyword arguments of ``VmasEnv(FormationNavigation(), ...)``:
+
+    * ``formation``, ``n_robots``, ``formation_width`` (m): the shape, see
+      :func:`~redig.envs.formations.formation_offsets`.
+    * ``corridor_width``, ``corridor_length`` (m), ``corridor_angle`` (rad): the default map;
+      ``obstacle_map`` (:class:`~redig.envs.maps.ObstacleMap`) replaces it.
+    * ``start_distance`` (m): from the map's centre to the centre of the start and of the goal formation, along
+      ``corridor_angle``. ``position_jitter`` (m) and ``heading_jitter`` (rad): half ranges of what is added to each.
+    * ``radius`` (m), ``max_speed`` (m/s), ``max_acceleration`` (m/s²), ``dt`` (s): the robots.
+    * ``observe_direction``: add the unit vector to the nearest obstacle (9 numbers); ``False`` gives the paper's 7.
+    * ``formation_reward``: one of ``spring_damper`` (Eq. 29), ``spring_damper_bonus``, ``scaled``, ``none``;
+      ``formation_weight``; ``omega``.
+    * ``navigation_reward``: ``goal_speed`` (Eq. 30) or ``progress``; ``arrival_bonus``, ``goal_radius`` (m);
+      ``collision_penalty``; ``proximity_penalty`` and ``proximity_margin`` (m), a ramp before contact.
+    * ``collision_terminates``, ``arrival_terminates``: what ends the task of one robot (``info["terminated"]``).
+    * ``hold_steps``: steps for which the team holds at its goals before the episode ends.
+
+    Observation of a robot: position (m), velocity (m/s), goal - position (m), distance to the nearest obstacle (m) and,
+    optionally, the unit vector to it. A robot that has arrived holds: it is steered to its goal whatever its command.
+
+    ``info`` of a robot: ``position``, ``velocity``, ``pairwise_distance`` ``[n]``, ``navigation_reward``,
+    ``formation_reward``, ``arrival_reward``, ``collision_reward``, ``wall_collision``, ``robot_collision``,
+    ``collision``, ``arrived``, ``terminated`` (0 or 1).
+
+    Raises:
+        ValueError: for an unknown name, a size that is not positive, a corridor too narrow for one robot, or a start or
+            goal inside a wall.
+        TypeError: for an unknown keyword argument.
+
+    Examples:
+        >>> from torchrl.envs import VmasEnv
+        >>> from redig.envs import FormationNavigation
+        >>> env = VmasEnv(FormationNavigation(), num_envs=4, formation="line", n_robots=3, seed=0)
+        >>> env.reset()["agents", "observation"].shape
+        torch.Size([4, 3, 9])
+    """
+
+    def make_world(self, batch_dim: int, device: torch.device, **kwargs) -> World:
+        """Build the team and its map (called by VMAS)."""
+        self._read_arguments(kwargs)
+        offsets = formation_offsets(self.formation, self.n_robots, self.formation_width)
+        self.offsets = offsets.to(device)
+        self.desired = pairwise_distances(self.offsets)
+        self.obstacle_map = self.obstacle_map.to(device)
+        angle = torch.tensor(self.corridor_angle, device=device)
+        self.axis = torch.stack([angle.cos(), angle.sin()])
+        world = World(batch_dim, device, dt=self.dt, drag=0.0)
+        for i in range(self.n_robots):
+            world.add_agent(
+                Agent(
+                    name=f"agent_{i}",
+                    shape=Sphere(self.radius),
+                    rotatable=False,
+                    collide=False,  # contact is resolved against the signed distance, see ``post_step``
+                    mass=1.0,
+                    max_f=self.max_acceleration,
+                    u_range=self.max_speed,
+                    dynamics=VelocityCommand(self.dt, self.max_speed),
+                )
+            )
+        batch = (batch_dim, self.n_robots)
+        self.goal = torch.zeros(*batch, 2, device=device)
+        self.direction = self.axis.expand(batch_dim, 2).clone()
+        self.arrived = torch.zeros(batch, dtype=torch.bool, device=device)
+        self.held = torch.zeros(batch_dim, dtype=torch.long, device=device)
+        self.quantities: dict[str, Tensor] = {}
+        return world
+
+    def _read_arguments(self, kwargs: dict) -> None:
+        take = kwargs.pop
+        self.formation = take("formation", "wedge")
+        self.n_robots = take("n_robots", 5)
+        self.formation_width = take("formation_width", 2.0)
+        corridor_width, corridor_length = take("corridor_width", 1.1), take("corridor_length", 2.0)
+        self.corridor_angle = take("corridor_angle", 0.0)
+        self.start_distance = take("start_distance", 2.75)
+        self.position_jitter = take("position_jitter", 0.25)
+        self.heading_jitter = take("heading_jitter", 0.1)
+        self.radius, self.dt = take("radius", 0.1), take("dt", 0.1)
+        self.max_speed, self.max_acceleration = take("max_speed", 1.0), take("max_acceleration", 2.0)
+        self.observe_direction = take("observe_direction", True)
+        self.formation_reward = take("formation_reward", "spring_damper")
+        self.formation_weight, self.omega = take("formation_weight", 1.0), take("omega", 0.5)
+        self.navigation_reward = take("navigation_reward", "goal_speed")
+        self.arrival_bonus, self.goal_radius = take("arrival_bonus", 15.0), take("goal_radius", 0.1)
+        self.collision_penalty = take("collision_penalty", 1.5)
+        self.proximity_penalty, self.proximity_margin = take("proximity_penalty", 0.0), take("proximity_margin", 0.1)
+        self.collision_terminates = take("collision_terminates", False)
+        self.arrival_terminates = take("arrival_terminates", True)
+        self.hold_steps = take("hold_steps", 10)
+        positive = ("radius", "dt", "max_speed", "max_acceleration", "goal_radius", "proximity_margin", "start_distance")
+        for name in positive:
+            if not getattr(self, name) > 0:
+                raise ValueError(f"{name}: got {getattr(self, name)}, must be greater than 0")
+        for name, allowed in (("formation_reward", FORMATION_REWARDS), ("navigation_reward", NAVIGATION_REWARDS)):
+            if getattr(self, name) not in allowed:
+                raise ValueError(f"{name}: got {getattr(self, name)!r}, allowed are {', '.join(allowed)}")
+        if corridor_width <= 2 * self.radius:
+            raise ValueError(
+                f"corridor_width: got {corridor_width} m, too narrow for one robot of radius {self.radius} m; "
+                f"it must be greater than {2 * self.radius} m"
+            )
+        obstacle_map: ObstacleMap | None = take("obstacle_map", None)
+        self.obstacle_map = obstacle_map or corridor(corridor_width, corridor_length, self.corridor_angle)
+        if kwargs:
+            raise TypeError(f"unknown argument(s) of FormationNavigation: {', '.join(sorted(kwargs))}")
+
+    def reset_world_at(self, env_index: int | None = None) -> None:
+        """Draw new start and goal formations for one environment, or for all."""
+        index = slice(None) if env_index is None else slice(env_index, env_index + 1)
+        batch = self.goal[index].shape[0]
+        start_centre, start = self._formation_at(-self.start_distance, batch)
+        goal_centre, goal = self._formation_at(self.start_distance, batch)
+        for name, place in (("start", start), ("goal", goal)):
+            inside = self.obstacle_map.signed_distance(place) < self.radius
+            if inside.any():
+                env, robot = inside.nonzero()[0].tolist()
+                raise ValueError(
+                    f"start_distance: with {self.start_distance} m the {name} of robot {robot} lies inside a wall, at "
+                    f"{[round(x, 2) for x in place[env, robot].tolist()]} m; choose a larger distance or less jitter"
+                )
+        travel = goal_centre - start_centre
+        self.direction[index] = travel / travel.norm(dim=-1, keepdim=True)
+        self.goal[index] = goal
+        self.arrived[index] = False
+        self.held[index] = 0
+        for i, agent in enumerate(self.world.agents):
+            agent.set_pos(start[:, i] if env_index is None else start[0, i], batch_index=env_index)
+            agent.set_vel(torch.zeros_like(agent.state.vel if env_index is None else start[0, i]), batch_index=env_index)
+        self._measure(self._positions())
+
+    def _formation_at(self, distance: float, batch: int) -> tuple[Tensor, Tensor]:
+        """Centres ``[batch, 2]`` and robots' places ``[batch, n, 2]`` of randomised formations along the corridor."""
+        device = self.axis.device
+        along = distance + self.position_jitter * (2 * torch.rand(batch, 1, device=device) - 1)
+        across = self.position_jitter * (2 * torch.rand(batch, 1, device=device) - 1)
+        centre = along * self.axis + across * torch.stack([-self.axis[1], self.axis[0]])
+        heading = self.corridor_angle + self.heading_jitter * (2 * torch.rand(batch, 1, device=device) - 1)
+        cos, sin = heading.cos(), heading.sin()
+        forward, left = self.offsets.unbind(-1)
+        place = torch.stack([cos * forward - sin * left, sin * forward + cos * left], -1)
+        return centre, centre.unsqueeze(1) + place
+
+    def process_action(self, agent: Agent) -> None:
+        """A robot that has arrived holds: its command steers it to its goal."""
+        i = self.world.agents.index(agent)
+        to_goal = (self.goal[:, i] - agent.state.pos) / (4 * self.dt)
+        hold = to_goal.clamp(-self.max_speed, self.max_speed)
+        agent.action.u = torch.where(self.arrived[:, i, None], hold, agent.action.u)
+
+    def _positions(self) -> Tensor:
+        return torch.stack([agent.state.pos for agent in self.world.agents], 1)
+
+    def _velocities(self) -> Tensor:
+        return torch.stack([agent.state.vel for agent in self.world.agents], 1)
+
+    def pre_step(self) -> None:
+        """Remember where the robots were, for the progress reward."""
+        self.previous_position = self._positions()
+
+    def post_step(self) -> None:
+        """Resolve contacts, then measure the step."""
+        position, velocity = self._positions(), self._velocities()
+        obstacle_distance, direction = self.obstacle_map.nearest(position)
+        wall = obstacle_distance < self.radius
+        free = rewards.clearance(position, obstacle_distance, self.radius)
+        mate = rewards.clearance(position, torch.full_like(obstacle_distance, 1e9), self.radius) < 0
+        position, velocity = separate(position, velocity, self.radius, obstacle_distance, direction)
+        for i, agent in enumerate(self.world.agents):
+            agent.state.pos, agent.state.vel = position[:, i], velocity[:, i]
+        collision = wall | mate
+        near_goal = (self.goal - position).norm(dim=-1) < self.goal_radius
+        arriving = near_goal & ~self.arrived
+        moving = ~self.arrived
+        self.arrived = self.arrived | near_goal
+        self.held = torch.where(self.arrived.all(-1), self.held + 1, 0)
+
+        if self.navigation_reward == "progress":
+            navigation = rewards.progress(self.previous_position, position, self.goal, self.dt)
+        else:
+            navigation = rewards.goal_speed(position, velocity, self.goal)
+        parts = {
+            "navigation_reward": navigation * moving,
+            "formation_reward": self._formation_reward(position, velocity),
+            "arrival_reward": self.arrival_bonus * arriving,
+            "collision_reward": -self.collision_penalty * collision
+            - self.proximity_penalty * rewards.proximity(free, self.proximity_margin),
+        }
+        terminated = (collision & self.collision_terminates) | (self.arrived & self.arrival_terminates)
+        self._measure(position, parts, wall, mate, terminated)
+
+    def _formation_reward(self, position: Tensor, velocity: Tensor) -> Tensor:
+        if self.formation_reward == "scaled":
+            team = rewards.scaled_formation_bonus(position, self.offsets, self.direction)
+        elif self.formation_reward == "spring_damper":
+            team = rewards.spring_damper(position, velocity, self.desired, self.omega)
+        elif self.formation_reward == "spring_damper_bonus":
+            return self.formation_weight * rewards.spring_damper_bonus(position, velocity, self.desired, self.omega)
+        else:
+            team = position.new_zeros(position.shape[0])
+        return self.formation_weight * team.unsqueeze(-1).expand(-1, self.n_robots)
+
+    def _measure(
+        self,
+        position: Tensor,
+        parts: dict[str, Tensor] | None = None,
+        wall: Tensor | None = None,
+        mate: Tensor | None = None,
+        terminated: Tensor | None = None,
+    ) -> None:
+        """Everything that ``observation``, ``reward`` and ``info`` hand out, for the whole team: ``[B, n, ...]``."""
+        zero = position.new_zeros(position.shape[:2])
+        velocity = self._velocities()
+        distance, direction = self.obstacle_map.nearest(position)
+        observation = [position, velocity, self.goal - position, distance.unsqueeze(-1)]
+        if self.observe_direction:
+            observation.append(direction)
+        names = ("navigation_reward", "formation_reward", "arrival_reward", "collision_reward")
+        parts = parts or dict.fromkeys(names, zero)
+        wall = zero if wall is None else wall.to(zero.dtype)
+        mate = zero if mate is None else mate.to(zero.dtype)
+        self.quantities = {
+            "observation": torch.cat(observation, -1),
+            "reward": sum(parts.values()),
+            "position": position,
+            "velocity": velocity,
+            "pairwise_distance": pairwise_distances(position),
+            **parts,
+            "wall_collision": wall,
+            "robot_collision": mate,
+            "collision": torch.maximum(wall, mate),
+            "arrived": self.arrived.to(zero.dtype),
+            "terminated": zero if terminated is None else terminated.to(zero.dtype),
+        }
+
+    def observation(self, agent: Agent) -> Tensor:
+        """State of one robot ``[B, 9]`` (or 7)."""
+        return self.quantities["observation"][:, self.world.agents.index(agent)]
+
+    def reward(self, agent: Agent) -> Tensor:
+        """Reward of one robot ``[B]``."""
+        return self.quantities["reward"][:, self.world.agents.index(agent)]
+
+    def info(self, agent: Agent) -> dict[str, Tensor]:
+        """What metrics and losses need of one robot, each ``[B, ...]``."""
+        i = self.world.agents.index(agent)
+        return {k: v[:, i] for k, v in self.quantities.items() if k not in ("observation", "reward")}
+
+    def done(self) -> Tensor:
+        """True ``[B]`` once the whole team has held at its goals for ``hold_steps``."""
+        return self.held >= self.hold_steps

@@ -1,0 +1,166 @@
+"""Rewards as pure functions of position and velocity: Eq. 29 and 30 as printed, and the variants that train.
+
+Every function takes a team at once. Positions are in m, velocities in m/s, one reward a robot (or one a team where the
+paper has one a team), in the paper's units before any reward scaling.
+"""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+from redig.envs.formations import pairwise_distances
+
+
+def spring_damper(position: Tensor, velocity: Tensor, desired: Tensor, omega: float = 0.5) -> Tensor:
+    """Spring-damper reward of the team, Eq. 29 as printed: the sum over all pairs, unbounded and never positive.
+
+    ``R = sum_{i,j} -omega |d_ij - p_ij| - (1 - omega) q_ij``; both orders of a pair are counted, as in the paper.
+
+    Args:
+        position: ``[*B, n, 2]`` (m).
+        velocity: ``[*B, n, 2]`` (m/s).
+        desired: desired distances d_ij ``[n, n]`` (m).
+        omega: balance of spring and damper, in [0, 1].
+
+    Returns:
+        reward ``[*B]``, the same for every robot of the team.
+
+    Examples:
+        >>> import torch
+        >>> line = torch.tensor([[0.0, 0.0], [1.0, 0.0]])
+        >>> spring_damper(line, torch.zeros(2, 2), 2 * torch.ones(2, 2) - 2 * torch.eye(2)).item()
+        -1.0
+    """
+    spring = (desired - pairwise_distances(position)).abs()
+    damper = pairwise_distances(velocity)
+    return -(omega * spring + (1 - omega) * damper).sum((-2, -1))
+
+
+def spring_damper_bonus(
+    position: Tensor, velocity: Tensor, desired: Tensor, omega: float = 0.8, clip: float = 1.0
+) -> Tensor:
+    """Eq. 29 as a bonus: the mean over teammates, clipped and offset, so that staying alive is never a loss.
+
+    ``mean_j (1 - min(|d_ij - p_ij|, clip) / clip) - (1 - omega) / omega * q_ij``; the ratio of spring to damper is the
+    paper's, and the default 0.8 gives the damper a quarter of the spring's weight.
+
+    Args:
+        position: ``[*B, n, 2]`` (m).
+        velocity: ``[*B, n, 2]`` (m/s).
+        desired: ``[n, n]`` (m).
+        omega: balance of spring and damper, in (0, 1].
+        clip: error of a distance (m) from which on the bonus of a pair is 0.
+
+    Returns:
+        reward ``[*B, n]``, at most 1.
+    """
+    n = position.shape[-2]
+    spring = 1 - (desired - pairwise_distances(position)).abs().clamp_max(clip) / clip
+    damper = pairwise_distances(velocity)
+    mates = 1 - torch.eye(n, dtype=position.dtype, device=position.device)
+    return ((spring - (1 - omega) / omega * damper) * mates).sum(-1) / (n - 1)
+
+
+def best_lateral_scale(
+    position: Tensor, offsets: Tensor, direction: Tensor, limits: tuple[float, float] = (0.3, 1.1)
+) -> tuple[Tensor, Tensor]:
+    """The lateral scaling of a formation that fits a team best, and how far each robot is from its scaled place.
+
+    With ``f`` the formation's offsets and ``q`` the team's, both from their centroids in the frame of travel,
+    ``s = sum f_y q_y / sum f_y^2``, clamped.
+
+    Args:
+        position: ``[*B, n, 2]`` (m).
+        offsets: the formation ``[n, 2]`` (m), see :func:`redig.envs.formations.formation_offsets`.
+        direction: unit vector of travel ``[*B, 2]``, so that the corridor may point anywhere.
+        limits: smallest and largest scale.
+
+    Returns:
+        scale ``[*B]`` and residual ``[*B, n]`` (m).
+    """
+    relative = position - position.mean(-2, keepdim=True)
+    direction = direction.unsqueeze(-2)
+    forward = (relative * direction).sum(-1)
+    left = relative[..., 1] * direction[..., 0] - relative[..., 0] * direction[..., 1]
+    scale = (left * offsets[:, 1]).sum(-1) / offsets[:, 1].square().sum()
+    scale = scale.clamp(*limits)
+    error = torch.stack([forward - offsets[:, 0], left - scale.unsqueeze(-1) * offsets[:, 1]], -1)
+    return scale, error.norm(dim=-1)
+
+
+def scaled_formation_bonus(
+    position: Tensor,
+    offsets: Tensor,
+    direction: Tensor,
+    tolerance: float = 0.5,
+    squeeze_cost: float = 0.5,
+    limits: tuple[float, float] = (0.3, 1.1),
+) -> Tensor:
+    """Formation against the best lateral scaling of the shape: a squeezed formation counts as whole, and costs little.
+
+    ``1 - min(mean_i residual_i / tolerance, 1) - squeeze_cost * max(1 - s, 0)``, see :func:`best_lateral_scale`. The
+    spring term compares absolute distances while the CFI compares proportions; inside a corridor the two disagree, and
+    this form sides with the CFI.
+
+    Args:
+        position: ``[*B, n, 2]`` (m).
+        offsets: the formation ``[n, 2]`` (m).
+        direction: unit vector of travel ``[*B, 2]``.
+        tolerance: mean residual (m) at which the bonus is gone.
+        squeeze_cost: price of a formation squeezed to nothing; it makes the team spread again behind the corridor.
+        limits: smallest and largest lateral scale.
+
+    Returns:
+        reward ``[*B]`` of the team, at most 1.
+
+    Examples:
+        >>> import torch
+        >>> from redig.envs.formations import formation_offsets
+        >>> wedge = formation_offsets("wedge", 5)
+        >>> scaled_formation_bonus(wedge, wedge, torch.tensor([1.0, 0.0])).item()
+        1.0
+    """
+    scale, residual = best_lateral_scale(position, offsets, direction, limits)
+    return 1 - (residual.mean(-1) / tolerance).clamp_max(1) - squeeze_cost * (1 - scale).clamp_min(0)
+
+
+def goal_speed(position: Tensor, velocity: Tensor, goal: Tensor) -> Tensor:
+    """The moving part of Eq. 30, ``q . r / |r| * |q|``: speed times its alignment with the goal. ``[*B, n]``."""
+    to_goal = goal - position
+    heading = to_goal / to_goal.norm(dim=-1, keepdim=True).clamp_min(1e-9)
+    return (velocity * heading).sum(-1) * velocity.norm(dim=-1)
+
+
+def progress(previous_position: Tensor, position: Tensor, goal: Tensor, dt: float) -> Tensor:
+    """Speed at which the goal comes nearer (m/s), ``[*B, n]``: the form of navigation reward that trains best.
+
+    Examples:
+        >>> import torch
+        >>> origin = torch.zeros(1, 2)
+        >>> progress(origin, origin + 0.1, torch.tensor([[3.0, 3.0]]), dt=0.1).item() > 1.4
+        True
+    """
+    return ((goal - previous_position).norm(dim=-1) - (goal - position).norm(dim=-1)) / dt
+
+
+def clearance(position: Tensor, obstacle_distance: Tensor, radius: float) -> Tensor:
+    """Free space around each robot (m): to the nearest wall or teammate, 0 at contact.
+
+    Args:
+        position: ``[*B, n, 2]`` (m).
+        obstacle_distance: signed distance of the robot's centre to the nearest obstacle ``[*B, n]`` (m).
+        radius: of a robot (m).
+
+    Returns:
+        ``[*B, n]`` (m); negative where robots overlap or stand inside a wall, which is a collision of either kind.
+    """
+    n = position.shape[-2]
+    myself = torch.eye(n, dtype=torch.bool, device=position.device)
+    mate = pairwise_distances(position).masked_fill(myself, float("inf")).amin(-1) - 2 * radius
+    return torch.minimum(mate, obstacle_distance - radius)
+
+
+def proximity(clearance: Tensor, margin: float = 0.1) -> Tensor:
+    """Ramp that warns of a collision: 0 with ``margin`` (m) or more of free space, 1 at contact. ``[*B, n]``."""
+    return (1 - clearance / margin).clamp(0, 1)
