@@ -1,1 +1,27 @@
-"""ReDiG."""
+"""ReDiG, Reinforced Diffusion on Graphs: robot teams that cross narrow corridors in formation, as TorchRL modules."""
+
+from redig.envs import FormationNavigation, ObstacleMap, corridor, formation_offsets
+from redig.modules import DDPM, DenoisingMLP, DiffusionActor, GraphEncoder, NoiseSchedule, QNetwork
+from redig.objectives import DIPOLoss, MultiStep
+from redig.policy import PolicyConfig, build_policy, load_policy, save_policy
+
+__version__ = "0.1.0"
+
+__all__ = [
+    "DDPM",
+    "DIPOLoss",
+    "DenoisingMLP",
+    "DiffusionActor",
+    "FormationNavigation",
+    "GraphEncoder",
+    "MultiStep",
+    "NoiseSchedule",
+    "ObstacleMap",
+    "PolicyConfig",
+    "QNetwork",
+    "build_policy",
+    "corridor",
+    "formation_offsets",
+    "load_policy",
+    "save_policy",
+]

@@ -1,0 +1,93 @@
+"""The denoising network: which noise is in this action, given the step and the team embedding."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+
+import torch
+from torch import Tensor, nn
+
+ACTIVATIONS: dict[str, type[nn.Module]] = {"mish": nn.Mish, "relu": nn.ReLU, "silu": nn.SiLU, "tanh": nn.Tanh}
+
+
+def mlp(
+    in_features: int, hidden: Sequence[int], out_features: int, activation: str = "mish", layer_norm: bool = False
+) -> nn.Sequential:
+    """Multi-layer perceptron, optionally with LayerNorm after each hidden linear layer.
+
+    Raises:
+        ValueError: for an unknown activation.
+    """
+    if activation not in ACTIVATIONS:
+        raise ValueError(f"activation: got {activation!r}, allowed are {', '.join(ACTIVATIONS)}")
+    layers: list[nn.Module] = []
+    for width in hidden:
+        layers.append(nn.Linear(in_features, width))
+        if layer_norm:
+            layers.append(nn.LayerNorm(width))
+        layers.append(ACTIVATIONS[activation]())
+        in_features = width
+    return nn.Sequential(*layers, nn.Linear(in_features, out_features))
+
+
+def sinusoidal_embedding(step: Tensor, dim: int, max_period: float = 10_000.0) -> Tensor:
+    """Sinusoidal embedding of the diffusion step (Vaswani et al., 2017): ``[*B]`` to ``[*B, dim]``.
+
+    Examples:
+        >>> import torch
+        >>> sinusoidal_embedding(torch.tensor([0.0]), 4)
+        tensor([[0., 0., 1., 1.]])
+    """
+    half = dim // 2
+    frequency = torch.exp(-math.log(max_period) * torch.arange(half, device=step.device) / max(half - 1, 1))
+    angle = step.unsqueeze(-1) * frequency
+    return torch.cat([angle.sin(), angle.cos()], -1)
+
+
+class DenoisingMLP(nn.Module):
+    """eps_theta(a^k, k | h): Mish perceptron on the noisy action, the embedded step and the team embedding.
+
+    Args:
+        action_dim: A.
+        embedding_dim: width of the embedding h.
+        hidden: widths of the hidden layers (the paper: 3 of 256).
+        step_dim: width of the sinusoidal embedding of the step.
+        activation: ``"mish"`` (the paper), ``"relu"``, ``"silu"`` or ``"tanh"``.
+
+    Examples:
+        >>> import torch
+        >>> denoiser = DenoisingMLP(action_dim=2, embedding_dim=64)
+        >>> denoiser(torch.zeros(8, 5, 2), torch.zeros(8, 5), torch.zeros(8, 5, 64)).shape
+        torch.Size([8, 5, 2])
+    """
+
+    def __init__(
+        self,
+        action_dim: int,
+        embedding_dim: int,
+        hidden: Sequence[int] = (256, 256, 256),
+        step_dim: int = 16,
+        activation: str = "mish",
+    ) -> None:
+        super().__init__()
+        if step_dim < 2 or step_dim % 2:
+            raise ValueError(f"step_dim: got {step_dim}, must be even and at least 2")
+        self.action_dim = action_dim
+        self.step_dim = step_dim
+        self.net = mlp(action_dim + step_dim + embedding_dim, hidden, action_dim, activation)
+
+    def forward(self, action: Tensor, step: Tensor, embedding: Tensor) -> Tensor:
+        """Predict the noise.
+
+        Args:
+            action: noisy action ``[*B, A]``.
+            step: ``[*B]`` or a scalar tensor, counted from 0.
+            embedding: ``[*B, H]``.
+
+        Returns:
+            noise ``[*B, A]``.
+        """
+        time = sinusoidal_embedding(step.to(action.dtype), self.step_dim)
+        time = time.expand(*action.shape[:-1], self.step_dim)
+        return self.net(torch.cat([action, time, embedding], -1))
