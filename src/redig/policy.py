@@ -9,7 +9,7 @@ from pathlib import Path
 
 import torch
 from safetensors import SafetensorError, safe_open
-from safetensors.torch import save_file
+from safetensors.torch import save
 from tensordict.nn import TensorDictModule, TensorDictSequential
 from torchrl.data import Bounded
 
@@ -102,7 +102,7 @@ def save_policy(
     path = Path(path)
     header = {"format": FORMAT, "policy": json.dumps(asdict(config)), "environment": json.dumps(environment or {})}
     temporary = path.with_name(path.name + ".tmp")
-    save_file({k: v.detach().cpu().contiguous() for k, v in policy.state_dict().items()}, temporary, header)
+    temporary.write_bytes(save({k: v.detach().cpu().contiguous() for k, v in policy.state_dict().items()}, header))
     os.replace(temporary, path)
 
 

@@ -34,7 +34,8 @@ class FormationNavigation(BaseScenario):
     * ``radius`` (m), ``max_speed`` (m/s), ``max_acceleration`` (m/s²), ``dt`` (s): the robots.
     * ``observe_direction``: add the unit vector to the nearest obstacle (9 numbers); ``False`` gives the paper's 7.
     * ``formation_reward``: one of ``spring_damper`` (Eq. 29), ``spring_damper_bonus``, ``scaled``, ``none``;
-      ``formation_weight``; ``omega``.
+      ``formation_weight``; ``omega``. The frame of ``scaled`` is the goal formation's heading, so that the goal
+      itself is a perfect formation.
     * ``navigation_reward``: ``goal_speed`` (Eq. 30) or ``progress``; ``arrival_bonus``, ``goal_radius`` (m);
       ``collision_penalty``; ``proximity_penalty`` and ``proximity_margin`` (m), a ramp before contact.
     * ``collision_terminates``, ``arrival_terminates``: what ends the task of one robot (``info["terminated"]``).
@@ -134,8 +135,8 @@ class FormationNavigation(BaseScenario):
         """Draw new start and goal formations for one environment, or for all."""
         index = slice(None) if env_index is None else slice(env_index, env_index + 1)
         batch = self.goal[index].shape[0]
-        start_centre, start = self._formation_at(-self.start_distance, batch)
-        goal_centre, goal = self._formation_at(self.start_distance, batch)
+        _, start = self._formation_at(-self.start_distance, batch)
+        goal_heading, goal = self._formation_at(self.start_distance, batch)
         for name, place in (("start", start), ("goal", goal)):
             inside = self.obstacle_map.signed_distance(place) < self.radius
             if inside.any():
@@ -144,8 +145,7 @@ class FormationNavigation(BaseScenario):
                     f"start_distance: with {self.start_distance} m the {name} of robot {robot} lies inside a wall, at "
                     f"{[round(x, 2) for x in place[env, robot].tolist()]} m; choose a larger distance or less jitter"
                 )
-        travel = goal_centre - start_centre
-        self.direction[index] = travel / travel.norm(dim=-1, keepdim=True)
+        self.direction[index] = goal_heading
         self.goal[index] = goal
         self.arrived[index] = False
         self.held[index] = 0
@@ -155,7 +155,7 @@ class FormationNavigation(BaseScenario):
         self._measure(self._positions())
 
     def _formation_at(self, distance: float, batch: int) -> tuple[Tensor, Tensor]:
-        """Centres ``[batch, 2]`` and robots' places ``[batch, n, 2]`` of randomised formations along the corridor."""
+        """Headings ``[batch, 2]`` and robots' places ``[batch, n, 2]`` of randomised formations along the corridor."""
         device = self.axis.device
         along = distance + self.position_jitter * (2 * torch.rand(batch, 1, device=device) - 1)
         across = self.position_jitter * (2 * torch.rand(batch, 1, device=device) - 1)
@@ -164,7 +164,7 @@ class FormationNavigation(BaseScenario):
         cos, sin = heading.cos(), heading.sin()
         forward, left = self.offsets.unbind(-1)
         place = torch.stack([cos * forward - sin * left, sin * forward + cos * left], -1)
-        return centre, centre.unsqueeze(1) + place
+        return torch.cat([cos, sin], -1), centre.unsqueeze(1) + place
 
     def process_action(self, agent: Agent) -> None:
         """A robot that has arrived holds: its command steers it to its goal."""
@@ -257,6 +257,20 @@ class FormationNavigation(BaseScenario):
             "arrived": self.arrived.to(zero.dtype),
             "terminated": zero if terminated is None else terminated.to(zero.dtype),
         }
+
+    def state_dict(self) -> dict[str, Tensor]:
+        """Everything that the next step depends on, so that a run can be resumed exactly."""
+        state = {name: getattr(self, name).clone() for name in ("goal", "direction", "arrived", "held")}
+        return {"position": self._positions(), "velocity": self._velocities(), **state}
+
+    def load_state_dict(self, state: dict[str, Tensor]) -> None:
+        """Put the team where :meth:`state_dict` found it."""
+        for name in ("goal", "direction", "arrived", "held"):
+            setattr(self, name, state[name].clone())
+        for i, agent in enumerate(self.world.agents):
+            agent.set_pos(state["position"][:, i], batch_index=None)
+            agent.set_vel(state["velocity"][:, i], batch_index=None)
+        self._measure(self._positions())
 
     def observation(self, agent: Agent) -> Tensor:
         """State of one robot ``[B, 9]`` (or 7)."""

@@ -90,6 +90,8 @@ class DIPOLoss(LossModule):
             reward, done, terminated: under ``"next"``.
             priority: where the TD error is written.
             demonstration: flag of transitions to imitate as they are.
+            actor_mask: optional flag ``[*B, n, 1]`` of the robots whose action counts for the actor; false for one whose
+                action the environment did not carry out, such as a robot that has arrived and holds.
             steps_to_next_obs: length of n-step windows.
         """
 
@@ -103,6 +105,7 @@ class DIPOLoss(LossModule):
         priority: NestedKey = "td_error"
         priority_weight: NestedKey = "priority_weight"
         demonstration: NestedKey = "demonstration"
+        actor_mask: NestedKey = "actor_mask"
         steps_to_next_obs: NestedKey = "steps_to_next_obs"
 
     tensor_keys: _AcceptedKeys
@@ -253,7 +256,7 @@ class DIPOLoss(LossModule):
             conditions = [embedding[key] for key in self.actor_network.in_keys]
             error = self.actor_network.module.denoising_error(refined, *conditions)
         weights = self._maybe_get_priority_weight(tensordict)
-        loss = self._reduce(error.unsqueeze(-1), tensordict, weights)
+        loss = self._reduce(error.unsqueeze(-1), tensordict, weights, tensordict.get(keys.actor_mask, None))
         return loss, {"refine_distance": (refined - base).norm(dim=-1).mean()}
 
     def refine(self, tensordict: TensorDictBase, action: Tensor) -> Tensor:
@@ -339,10 +342,12 @@ class DIPOLoss(LossModule):
             data["steps_to_next_obs"] = _per_robot(steps, reward)
         return self.value_estimator.value_estimate(data, next_value=next_value), next_value
 
-    def _reduce(self, loss: Tensor, tensordict: TensorDictBase, weights: Tensor | None) -> Tensor:
+    def _reduce(
+        self, loss: Tensor, tensordict: TensorDictBase, weights: Tensor | None, mask: Tensor | None = None
+    ) -> Tensor:
         if weights is not None:
             weights = weights.reshape(*tensordict.shape, *[1] * (loss.ndim - tensordict.ndim))
-        return self._reduce_loss(loss, tensordict=tensordict, weights=weights)
+        return self._reduce_loss(loss, tensordict=tensordict, weights=weights, mask=mask)
 
 
 def _under_next(key: NestedKey) -> NestedKey:

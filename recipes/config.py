@@ -1,0 +1,199 @@
+"""Options of the recipe, with a line of help for each."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+from dataclasses import dataclass
+from pathlib import Path
+
+SMOKE = {  # the whole program in under a minute; it learns nothing
+    "num_trajectories": 100, "clone_updates": 20, "critic_updates": 10, "warmup_steps": 20, "env_steps": 40,
+    "evaluation_interval": 20, "evaluation_starts": 8, "num_starts": 8, "num_envs": 8, "hidden": 32,
+}  # fmt: skip
+
+
+@dataclass
+class Config:
+    """Train ReDiG on a team that crosses a narrow corridor in formation. Defaults differ from the paper's Table 3 where
+    its plain recipe does not survive online training; docs/paper.md says what and why."""
+
+    out: Path | None = None
+    """Folder of the run; default runs/FORMATION-seedSEED."""
+    seed: int = 0
+    """Seed of everything: demonstrations, networks, training and evaluation starts."""
+    resume: Path | None = None
+    """Continue the run in this folder with its own configuration; all other options are ignored."""
+    smoke: bool = False
+    """Do everything at toy size, in under a minute."""
+    logger: str = "csv"
+    """csv, tensorboard or wandb (set WANDB_MODE=offline to log without a network)."""
+    threads: int | None = None
+    """Threads of PyTorch; default: its own choice. Results are bit-exact for a given number."""
+
+    # the task
+    formation: str = "wedge"
+    """wedge, line or circle."""
+    n_robots: int = 5
+    """Robots in the team."""
+    formation_width: float = 2.0
+    """Width of the formation (m)."""
+    corridor_width: float = 1.1
+    """Width of the corridor (m)."""
+    corridor_length: float = 2.0
+    """Length of the corridor (m)."""
+    max_speed: float = 1.0
+    """Speed limit (m/s)."""
+    max_acceleration: float = 2.0
+    """Acceleration limit (m/s²)."""
+    observe_direction: bool = True
+    """Observe the unit vector to the nearest obstacle; without it the state is the paper's seven numbers."""
+
+    # the reward
+    formation_reward: str = "scaled"
+    """scaled, spring_damper_bonus, spring_damper (Eq. 29) or none."""
+    formation_weight: float = 2.0
+    """Weight of the formation reward against progress in m/s."""
+    omega: float = 0.8
+    """Balance of spring and damper in the spring-damper forms (paper: 0.5)."""
+    navigation_reward: str = "progress"
+    """progress or goal_speed (Eq. 30)."""
+    arrival_bonus: float = 10.0
+    """Paid once to a robot on arrival (paper: 15)."""
+    collision_penalty: float = 20.0
+    """Penalty of a collision (paper: 1.5)."""
+    proximity_penalty: float = 0.5
+    """Ramp within 0.1 m of contact (paper: none)."""
+    collision_terminates: bool = True
+    """A collision ends the robot's return: its value is not bootstrapped."""
+    arrival_terminates: bool = False
+    """An arrival ends the robot's return; otherwise it holds and goes on earning the formation reward."""
+    reward_scale: float = 0.1
+    """Scale of the reward (paper: 0.01)."""
+
+    # demonstrations and cloning
+    num_trajectories: int = 5000
+    """Trajectories of single robots, planned without coordination."""
+    planner: str = "astar"
+    """astar or rrt."""
+    clone_updates: int = 3000
+    """Updates of the diffusion loss on demonstrations before online training."""
+    clone_batch: int = 128
+    """Teams in a batch of cloning."""
+    clone_lr: float = 1e-3
+    """Learning rate of cloning, annealed to a tenth."""
+
+    # online training
+    num_envs: int = 64
+    """Teams simulated in parallel."""
+    warmup_steps: int = 200
+    """Steps of all teams with the cloned policy before the actor moves."""
+    critic_updates: int = 2500
+    """Updates of the critics alone before the actor moves."""
+    env_steps: int = 3900
+    """Steps of all teams during online training."""
+    collect_steps: int = 20
+    """Steps of all teams between updates."""
+    updates_per_step: int = 4
+    """Critic updates for each step of all teams; the actor is updated half as often."""
+    batch_size: int = 52
+    """Teams in a batch."""
+    buffer_size: int = 250_000
+    """Capacity of the replay buffer, in team transitions."""
+    n_steps: int = 5
+    """Length of n-step returns."""
+    gamma: float = 0.98
+    """Discount factor (paper: 0.99)."""
+    tau: float = 0.01
+    """Rate of the target networks (paper: 0.005)."""
+    critic_lr: float = 1e-3
+    """Learning rate of the critics (paper: 3e-4)."""
+    actor_lr: float = 3e-4
+    """Learning rate of encoder and denoiser."""
+    final_lr: float = 1.0
+    """Share of both learning rates that is left at the end; they fall linearly."""
+    grad_norm: float = 2.0
+    """Limit on the norm of gradients."""
+    refine_steps: int = 1
+    """Gradient steps on each action."""
+    refine_step_size: float = 0.5
+    """Eta of the action refinement."""
+    refine_max_norm: float | None = None
+    """Limit on how far refinement moves an action (m/s)."""
+    refine_from: str = "stored"
+    """Refine the stored action (DIPO) or one freshly sampled from the policy (Algorithm 1 as printed)."""
+    exploration_noise: float = 0.15
+    """Standard deviation of the noise on executed commands (m/s)."""
+    warmup_noise: float = 0.3
+    """The same during warm-up."""
+    demonstration_share: float = 0.5
+    """Share of demonstrations in a critic batch at first; half of it in an actor batch."""
+    final_share: float = 0.02
+    """Share of demonstrations in all batches after share_steps."""
+    share_steps: int = 1500
+    """Steps over which the share falls."""
+    shared_encoder: bool = False
+    """One encoder for actor and critics, trained by both losses as in the paper, instead of one each."""
+    detach_encoder: bool = False
+    """Keep the critics' loss from a shared encoder."""
+
+    # networks and sampling
+    encoder: str = "edgeconv"
+    """edgeconv, or linear as printed in the paper."""
+    radius: float = 2.0
+    """Communication range (m)."""
+    hidden: int = 128
+    """Width of the three hidden layers of denoiser and critics (paper: 256)."""
+    layer_norm: bool = True
+    """LayerNorm in the critics."""
+    diffusion_steps: int = 100
+    """K."""
+    schedule: str = "cosine"
+    """cosine, linear or vp."""
+    sampling_steps: int = 5
+    """Steps of the strided sampling chain."""
+    noise_ratio: float = 0.0
+    """Noise added within the chain: 0 follows the posterior mean, 1 is Table 3's."""
+
+    # evaluation
+    evaluation_interval: int = 400
+    """Steps of all teams between evaluations and checkpoints."""
+    evaluation_starts: int = 128
+    """Starts of an evaluation during training; the best policy is chosen on these."""
+    num_starts: int = 256
+    """Starts of the final evaluation, never trained on and never used for a choice."""
+
+    def scenario(self) -> dict[str, object]:
+        """Arguments of :class:`redig.envs.FormationNavigation`."""
+        names = (
+            "formation", "n_robots", "formation_width", "corridor_width", "corridor_length", "max_speed",
+            "max_acceleration", "observe_direction", "formation_reward", "formation_weight", "omega",
+            "navigation_reward", "arrival_bonus", "collision_penalty", "proximity_penalty", "collision_terminates",
+            "arrival_terminates",
+        )  # fmt: skip
+        return {name: getattr(self, name) for name in names}
+
+    def resolve(self) -> Config:
+        """The configuration to run: that of a run to resume, or this one at toy size, checked.
+
+        Raises:
+            FileNotFoundError: if the folder to resume holds no run.
+            ValueError: for an option out of its range.
+        """
+        if self.resume is not None:
+            path = self.resume / "config.json"
+            if not path.is_file():
+                raise FileNotFoundError(f"resume: {self.resume} holds no run (no config.json)")
+            saved = json.loads(path.read_text())
+            return dataclasses.replace(Config(**saved), resume=self.resume, out=None)
+        config = dataclasses.replace(self, **SMOKE) if self.smoke else self
+        for name in (
+            "num_trajectories", "clone_updates", "clone_batch", "num_envs", "collect_steps", "updates_per_step",
+            "batch_size", "buffer_size", "evaluation_interval", "evaluation_starts", "num_starts", "hidden",
+        ):  # fmt: skip
+            if getattr(config, name) < 1:
+                raise ValueError(f"{name}: got {getattr(config, name)}, must be at least 1")
+        for name in ("demonstration_share", "final_share"):
+            if not 0 <= getattr(config, name) <= 1:
+                raise ValueError(f"{name}: got {getattr(config, name)}, must be in [0, 1]")
+        return config

@@ -1,0 +1,51 @@
+"""The end of a run: the final evaluation on starts never trained on, the tables and the figures."""
+
+from __future__ import annotations
+
+import platform
+
+import torch
+from config import Config
+from run import Run
+
+from redig.envs.factory import make_env
+from redig.evaluation import evaluate, format_table, rollout_trajectories, write_metrics
+from redig.policy import load_policy
+from redig.viz import animate, plot_learning_curves, plot_trajectories
+
+TEST_SEED = 2_000_000  # starts of the final evaluation, the same for every training seed
+
+
+def score(metrics: dict[str, float]) -> float:
+    """What the best policy has most of: whole teams that arrive, then formation, then speed, then smoothness."""
+    time = metrics["travel_time"] if metrics["travel_time_teams"] > 0 else 20.0
+    excess_jerk = max(metrics["jerk_mean"] - 2.0, 0.0)
+    return 4 * metrics["team_success_rate"] + metrics["cfi_0.5"] - 0.1 * time - 0.1 * excess_jerk
+
+
+def finish(run: Run, config: Config) -> dict[str, float]:
+    """Evaluate the cloned, the last and the best policy of a run, and leave its metrics and pictures."""
+    env = make_env(config.num_starts, **config.scenario())
+    results = {}
+    for name in ("cloned", "last", "policy"):
+        results[name] = evaluate(load_policy(run.folder / f"{name}.safetensors"), env, seed=TEST_SEED)
+        title = {"cloned": "cloned (before online training)", "policy": "best by validation"}.get(name, name)
+        print(f"\n{title}, {config.num_starts} starts never trained on\n{format_table(results[name])}")
+    metrics = results["policy"]
+    others = {f"{name}_{key}": value for name in ("cloned", "last") for key, value in results[name].items()}
+    write_metrics(run.folder / "metrics.json", {**metrics, **others})
+    draw(run, config)
+    print(f"\neverything is in {run.folder} ({platform.processor() or platform.machine()}, {torch.get_num_threads()} threads)")
+    return metrics
+
+
+def draw(run: Run, config: Config) -> None:
+    """The learning curve of a run, and one crossing of its policy as a figure and as an animation."""
+    plot_learning_curves(run.folder / "learning_curve.png", run.evaluations)
+    env = make_env(1, **config.scenario())
+    rollout = rollout_trajectories(load_policy(run.folder / "policy.safetensors"), env, seed=TEST_SEED)
+    position = rollout["position"][0, rollout["mask"][0]]
+    scenario = env.base_env.scenario
+    picture = {"formation": config.formation, "obstacle_map": scenario.obstacle_map, "goal": scenario.goal[0]}
+    plot_trajectories(run.folder / "trajectories.png", position, **picture)
+    animate(run.folder / "trajectories.gif", position, **picture)

@@ -1,0 +1,230 @@
+"""ReDiG (Algorithm 1): demonstrations, cloning, online training and evaluation of a team that crosses a corridor.
+
+Run ``python recipes/redig_wedge.py``; everything goes into one folder under ``runs/``. ``--formation line`` or
+``circle`` trains the other formations, ``--help`` explains each option.
+"""
+
+from __future__ import annotations
+
+import time
+from pathlib import Path
+
+import torch
+import tyro
+from config import Config
+from finish import finish, score
+from run import Run, check_logger
+from tensordict import TensorDictBase
+from tensordict.nn import TensorDictModule, TensorDictSequential
+from torchrl.collectors import Collector
+from torchrl.data import LazyTensorStorage, TensorDictReplayBuffer
+from torchrl.envs.utils import ExplorationType
+from torchrl.modules import AdditiveGaussianModule
+from torchrl.objectives import SoftUpdate
+
+from redig.checkpoint import collection_state, set_collection_state
+from redig.envs.factory import make_env
+from redig.evaluation import evaluate
+from redig.modules import QNetwork
+from redig.objectives import DIPOLoss, MultiStep
+from redig.planning import demonstrations
+from redig.policy import ACTION, EMBEDDING, OBSERVATION, PolicyConfig, build_encoder, build_policy, save_policy
+
+BASE_ACTION = ("agents", "policy_action")  # the policy's action before exploration noise
+VALIDATION_SEED = 1_000_000  # starts to choose the best policy on; training and final evaluation use others
+
+
+def train(config: Config) -> dict[str, float]:
+    """Algorithm 1, line by line; returns the metrics of the policy that it leaves."""
+    config = config.resolve()
+    check_logger(config.logger)
+    if config.threads is not None:
+        torch.set_num_threads(config.threads)
+    torch.manual_seed(config.seed)
+    scenario = config.scenario()
+    env = make_env(config.num_envs, seed=config.seed, reward_scale=config.reward_scale, **scenario)
+    validation_env = make_env(config.evaluation_starts, **scenario)
+    folder = config.resume or config.out or Path("runs") / f"{config.formation}-seed{config.seed}"
+    run = Run(folder, config, config.logger, resume=config.resume is not None)
+
+    # Line 1: initialise phi, psi, Q1 and Q2
+    policy_config = policy_architecture(config, env.observation_spec[OBSERVATION].shape[-1])
+    policy = build_policy(policy_config)
+    loss = make_loss(config, policy_config, policy)
+    target = SoftUpdate(loss, tau=config.tau)
+    actor_optimizer, critic_optimizer = make_optimizers(config, loss)
+
+    # Line 2: individual planners fill the buffer with uncoordinated trajectories
+    multi_step = MultiStep(config.n_steps, config.gamma, keep=[OBSERVATION, ACTION, BASE_ACTION, ARRIVED])
+    demo_env = make_env(min(250, config.num_trajectories), reward_scale=config.reward_scale, **scenario)
+    cache = folder.parent / "demonstrations"
+    episodes = demonstrations(demo_env, config.num_trajectories, config.planner, seed=config.seed, cache_dir=cache)
+    demos = transitions(multi_step(episodes)[episodes["mask"]], demonstration=True)
+    buffer = TensorDictReplayBuffer(storage=LazyTensorStorage(config.buffer_size))
+
+    noise = AdditiveGaussianModule(env.action_spec, config.warmup_noise, config.warmup_noise, action_key=ACTION)
+    keep_base = TensorDictModule(torch.clone, in_keys=[ACTION], out_keys=[BASE_ACTION])
+    collector = Collector(
+        env,
+        TensorDictSequential(*policy, keep_base, noise),
+        frames_per_batch=config.num_envs * config.collect_steps,
+        total_frames=-1,
+        postproc=multi_step,
+        exploration_type=ExplorationType.RANDOM,
+    )
+    experience = iter(collector)
+
+    def batch(share: float) -> TensorDictBase:
+        """Uniform samples of the buffer, a share of them demonstrations."""
+        of_demos = round(config.batch_size * share)
+        imitated = demos[torch.randint(len(demos), (of_demos,))]
+        return torch.cat([buffer.sample(config.batch_size - of_demos).select(*demos.keys(True, True)), imitated])
+
+    def update_critics(share: float) -> None:
+        value, _ = loss.qvalue_loss(batch(share))
+        run.step(value, critic_optimizer, config.grad_norm, "loss_q")
+        target.step()
+
+    def update_actor(data: TensorDictBase) -> None:
+        value, _ = loss.actor_loss(data)
+        run.step(value, actor_optimizer, config.grad_norm, "loss_pi")
+
+    def validate(phase: str, step: int) -> None:
+        metrics = evaluate(policy, validation_env, seed=VALIDATION_SEED + config.seed)
+        run.evaluation(metrics, phase=phase, updates=step * config.collect_steps * config.updates_per_step)
+        better = score(metrics) > run.best
+        run.best = max(run.best, score(metrics))
+        for name in ["cloned" if phase == "clone" else "last", *(["policy"] if better else [])]:
+            save_policy(folder / f"{name}.safetensors", policy, policy_config, scenario)
+
+    run.track(loss=loss, actor_optimizer=actor_optimizer, critic_optimizer=critic_optimizer, buffer=buffer)
+    run.track_state("collection", lambda: collection_state(env, collector), lambda s: set_collection_state(env, collector, s))
+    run.restore()
+
+    # Clone the demonstrations, so that online training starts from a policy that reaches most goals
+    for i in run.loop("clone", config.clone_updates):
+        learning_rate(actor_optimizer, config.clone_lr * (1 - 0.9 * i / config.clone_updates))
+        update_actor(demos[torch.randint(len(demos), (config.clone_batch,))])
+        if i + 1 == config.clone_updates:
+            copy_to_targets(loss)
+            validate("clone", 0)
+
+    # Let the critics learn the value of the cloned policy before the actor follows them
+    for _ in run.loop("warm-up", config.warmup_steps // config.collect_steps):
+        buffer.extend(transitions(next(experience)))
+    for _ in run.loop("critic", config.critic_updates):
+        update_critics(config.demonstration_share)
+
+    # Line 3: for each episode
+    noise.sigma.fill_(config.exploration_noise)
+    rounds, interval = config.env_steps // config.collect_steps, max(1, config.evaluation_interval // config.collect_steps)
+    for i in run.loop("online", rounds, checkpoint_every=interval):
+        # Lines 4, 5 and 8: embed the team, sample actions, act, store the transitions
+        started = time.perf_counter()
+        buffer.extend(transitions(next(experience)))
+        left = 1 - i / rounds
+        learning_rate(actor_optimizer, config.actor_lr * (config.final_lr + (1 - config.final_lr) * left))
+        learning_rate(critic_optimizer, config.critic_lr * (config.final_lr + (1 - config.final_lr) * left))
+        share = config.demonstration_share * max(0.0, 1 - i * config.collect_steps / config.share_steps)
+        for update in range(config.collect_steps * config.updates_per_step):
+            # Lines 9, 10 and 13: a batch, the critic loss (Eq. 2), a step of Q1 and Q2
+            update_critics(max(share, config.final_share))
+            # Lines 11, 6, 7 and 12: refine its actions, the diffusion loss on them (Eq. 1), a step of psi and phi
+            if update % 2:
+                update_actor(batch(max(share / 2, config.final_share)))
+        run.figures["frames/s"] = config.num_envs * config.collect_steps / (time.perf_counter() - started)
+        run.log(run.figures, i + 1, "train/")
+        if (i + 1) % interval == 0 or i + 1 == rounds:
+            validate("online", i + 1)
+
+    # Line 15: return the policy
+    return finish(run, config)
+
+
+ARRIVED = ("agents", "info", "arrived")
+
+
+def transitions(data: TensorDictBase, demonstration: bool = False) -> TensorDictBase:
+    """N-step transitions as a flat batch of teams, marked as demonstrations or not.
+
+    A robot that has arrived is steered by the environment, so its actions are not the actor's to learn.
+    """
+    data = data.reshape(-1)
+    data = data.select(OBSERVATION, ACTION, BASE_ACTION, ARRIVED, "next", "steps_to_next_obs", strict=False)
+    data["agents", "active"] = data[ARRIVED] < 0.5
+    if demonstration:
+        data[BASE_ACTION] = data[ACTION].clone()
+    data["demonstration"] = torch.full((len(data), 1), demonstration)
+    return data.exclude(("agents", "info"))
+
+
+def policy_architecture(config: Config, observation_dim: int) -> PolicyConfig:
+    """The policy that a configuration describes."""
+    return PolicyConfig(
+        observation_dim=observation_dim,
+        action_low=(-config.max_speed,) * 2,
+        action_high=(config.max_speed,) * 2,
+        radius=config.radius,
+        encoder=config.encoder,
+        encoder_activation="relu" if config.encoder == "edgeconv" else None,
+        hidden=(config.hidden,) * 3,
+        diffusion_steps=config.diffusion_steps,
+        schedule=config.schedule,
+        sampling_steps=config.sampling_steps,
+        noise_ratio=config.noise_ratio,
+    )
+
+
+def make_loss(config: Config, architecture: PolicyConfig, policy: TensorDictSequential) -> DIPOLoss:
+    """Twin critics and the DIPO loss around a policy."""
+    value = ("agents", "state_action_value")
+    critic = QNetwork(architecture.embedding_dim, 2, architecture.hidden, config.layer_norm)
+    loss = DIPOLoss(
+        *policy,
+        TensorDictModule(critic, in_keys=[EMBEDDING, ACTION], out_keys=[value]),
+        critic_encoder=None if config.shared_encoder else build_encoder(architecture),
+        detach_encoder=config.detach_encoder,
+        refine_steps=config.refine_steps,
+        refine_step_size=config.refine_step_size,
+        refine_max_norm=config.refine_max_norm,
+        refine_from=config.refine_from,
+    )
+    names = ("reward", "done", "terminated", "refined_action", "actor_mask", "priority")
+    keys = ("reward", "done", "terminated", "refined_action", "active", "td_error")
+    loss.set_keys(
+        action=ACTION,
+        base_action=BASE_ACTION,
+        state_action_value=value,
+        **{name: ("agents", key) for name, key in zip(names, keys, strict=True)},
+    )
+    return loss.make_value_estimator(gamma=config.gamma)
+
+
+def make_optimizers(config: Config, loss: DIPOLoss) -> tuple[torch.optim.Optimizer, torch.optim.Optimizer]:
+    """Adam for encoder and actor, and for the critics with their encoder (the shared one, where there is one)."""
+    critic_encoder = "encoder_network" if config.shared_encoder else "critic_encoder_network"
+
+    def adam(rate: float, *networks: str) -> torch.optim.Optimizer:
+        wanted = tuple(f"{network}_params" for network in networks)
+        return torch.optim.Adam([p for name, p in loss.named_parameters() if name.startswith(wanted)], rate)
+
+    return (
+        adam(config.actor_lr, "encoder_network", "actor_network"),
+        adam(config.critic_lr, critic_encoder, "qvalue_network"),
+    )
+
+
+def learning_rate(optimizer: torch.optim.Optimizer, rate: float) -> None:
+    """Set the learning rate of an optimizer."""
+    for group in optimizer.param_groups:
+        group["lr"] = rate
+
+
+def copy_to_targets(loss: DIPOLoss) -> None:
+    """Make the target actor equal to the cloned one."""
+    for name in ("encoder_network", "actor_network"):
+        getattr(loss, f"target_{name}_params").data.update_(getattr(loss, f"{name}_params").data)
+
+
+if __name__ == "__main__":
+    train(tyro.cli(Config))

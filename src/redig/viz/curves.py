@@ -1,0 +1,72 @@
+"""Learning curves: the metrics of the evaluations during training, over the updates."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Mapping, Sequence
+
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
+from matplotlib.ticker import MaxNLocator
+
+from redig.viz.scene import IMAGE_SUFFIXES, INK, PALETTE, check_suffix, replacing
+
+DASHES = (0, (4, 3))
+Row = Mapping[str, float | None]
+PANELS = (
+    ("success rate", {"success_rate": "robots", "team_success_rate": "teams"}, (-0.03, 1.03)),
+    ("travel time (s)", {"travel_time": ""}, None),
+    ("CFI at δ = 0.5 m", {"cfi_0.5": ""}, None),
+    ("mean jerk (m/s³)", {"jerk_mean": ""}, None),
+)
+
+
+def plot_learning_curves(path: str | os.PathLike, rows: Sequence[Row]) -> None:
+    """Draw success, travel time, CFI and jerk over the updates; dashed lines mark the cloned policy.
+
+    Args:
+        path: of the figure, PNG, PDF or SVG by its suffix; an existing file is replaced at once.
+        rows: one an evaluation, with the keys of :func:`redig.evaluation.evaluate` and ``updates``. The first row is
+            the cloned policy. Missing values (``None`` or NaN) leave gaps.
+
+    Raises:
+        ValueError: if there are no rows, or the suffix is not one of those allowed.
+        KeyError: if a row lacks a key.
+    """
+    path = check_suffix(path, IMAGE_SUFFIXES)
+    if not rows:
+        raise ValueError("rows: got none, expected at least one evaluation")
+    figure = Figure(figsize=(7.0, 4.2), layout="constrained")
+    for axes, (title, series, limits) in zip(figure.subplots(2, 2, sharex=True).flat, PANELS, strict=True):
+        _panel(axes, rows, series)
+        axes.set_title(title, size=9, loc="left")
+        if limits is not None:
+            axes.set_ylim(limits)
+        if axes.get_subplotspec().is_last_row():
+            axes.set_xlabel("updates", size=9)
+    cloned = Line2D([], [], color=INK, linestyle=DASHES, linewidth=0.9, label="cloned policy")
+    figure.legend(handles=[cloned], loc="outside upper right", fontsize=8, frameon=False)
+    with replacing(path) as unfinished:
+        figure.savefig(unfinished, dpi=200)
+
+
+def _panel(axes: Axes, rows: Sequence[Row], series: Mapping[str, str]) -> None:
+    """One panel: a line and its dashed reference for every key in ``series``, which maps keys to labels."""
+    updates = _column(rows, "updates")
+    for (key, label), colour, marker in zip(series.items(), PALETTE, "os", strict=False):
+        values = _column(rows, key)
+        axes.plot(updates, values, color=colour, marker=marker, markersize=3, linewidth=1.3, label=label)
+        axes.axhline(values[0], color=colour, linestyle=DASHES, linewidth=0.9)
+    if len(series) > 1:
+        axes.legend(fontsize=8, frameon=False)
+    axes.xaxis.set_major_locator(MaxNLocator(5, integer=True))
+    axes.grid(color="#DDDDDD", linewidth=0.6)
+    axes.tick_params(labelsize=8)
+    axes.spines[["top", "right"]].set_visible(False)
+
+
+def _column(rows: Sequence[Row], key: str) -> list[float]:
+    """Values of one key, NaN where one is missing."""
+    values = (row[key] for row in rows)
+    return [float("nan") if value is None else value for value in values]

@@ -1,0 +1,108 @@
+"""What every picture of a team shares: colours, the map, the shape of the formation, the view and the file."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+import numpy as np
+import torch
+from matplotlib.axes import Axes
+from matplotlib.patches import Polygon
+from numpy.typing import NDArray
+from torch import Tensor
+
+from redig.envs.formations import formation_offsets
+from redig.envs.maps import ObstacleMap
+
+# Okabe and Ito's palette for colour-blind readers, without its black (walls, text) and its yellow (too pale in print)
+PALETTE = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9")
+INK, WALL, SHAPE = "#222222", "#B8B8B8", "#666666"
+IMAGE_SUFFIXES = (".png", ".pdf", ".svg")
+VIDEO_SUFFIXES = (".gif", ".mp4")
+
+
+def robot_style(robot: int) -> tuple[str, str]:
+    """Colour and line style of a robot; where the colours repeat, the next line style begins."""
+    return PALETTE[robot % len(PALETTE)], ("-", "--", ":")[robot // len(PALETTE) % 3]
+
+
+def formation_outline(formation: str, n: int) -> list[int]:
+    """Order of the robots along the line that draws a formation: arm to arm, end to end, or once around.
+
+    Examples:
+        >>> formation_outline("wedge", 5), formation_outline("circle", 3)
+        ([3, 1, 0, 2, 4], [0, 1, 2, 0])
+    """
+    left = formation_offsets(formation, n)[:, 1]
+    if formation == "circle":
+        return [*range(n), 0]
+    return left.argsort(descending=formation == "wedge").tolist()
+
+
+def check_trajectory(position: Tensor, goal: Tensor | None) -> tuple[NDArray, NDArray | None]:
+    """Positions ``[T, n, 2]`` and goals ``[n, 2]`` (m) as arrays.
+
+    Raises:
+        ValueError: if a shape is wrong.
+    """
+    position = torch.as_tensor(position).detach().cpu()
+    if position.ndim != 3 or 0 in position.shape or position.shape[-1] != 2:
+        raise ValueError(f"position: got shape {list(position.shape)}, expected [T, n, 2] of one team")
+    if goal is None:
+        return position.numpy(), None
+    goal = torch.as_tensor(goal).detach().cpu()
+    if goal.shape != position.shape[1:]:
+        raise ValueError(f"goal: got shape {list(goal.shape)}, expected {list(position.shape[1:])}")
+    return position.numpy(), goal.numpy()
+
+
+def view(position: NDArray, goal: NDArray | None, margin: float = 0.5) -> tuple[float, float, float, float]:
+    """Region ``(x_min, x_max, y_min, y_max)`` (m) around the motion and the goals, never very long and thin."""
+    points = position.reshape(-1, 2) if goal is None else np.concatenate([position.reshape(-1, 2), goal])
+    low, high = points.min(0), points.max(0)
+    half = (high - low) / 2 + margin
+    half = np.maximum(half, half.max() / 3)
+    centre = (low + high) / 2
+    (x_min, y_min), (x_max, y_max) = centre - half, centre + half
+    return float(x_min), float(x_max), float(y_min), float(y_max)
+
+
+def draw_map(axes: Axes, obstacle_map: ObstacleMap, region: tuple[float, float, float, float]) -> None:
+    """Fill the obstacles and set up axes in metres that show ``region``."""
+    quarter = np.linspace(0, np.pi / 2, 17)
+    turn = np.concatenate([quarter + k * np.pi / 2 for k in range(4)])
+    corner = np.repeat([[1, 1], [-1, 1], [-1, -1], [1, -1]], len(quarter), axis=0)
+    for x, y, half_length, half_breadth, heading, radius in obstacle_map.obstacles.tolist():
+        local = corner * (half_length, half_breadth) + radius * np.stack([np.cos(turn), np.sin(turn)], -1)
+        cos, sin = np.cos(heading), np.sin(heading)
+        outline = local @ np.array([[cos, sin], [-sin, cos]]) + (x, y)
+        axes.add_patch(Polygon(outline, facecolor=WALL, edgecolor=SHAPE, linewidth=0.8, zorder=1))
+    axes.set(xlim=region[:2], ylim=region[2:], aspect="equal", xlabel="x (m)", ylabel="y (m)")
+    axes.tick_params(labelsize=8)
+
+
+def check_suffix(path: str | os.PathLike, allowed: tuple[str, ...]) -> Path:
+    """The path, whose suffix must be one of ``allowed``.
+
+    Raises:
+        ValueError: if it is not.
+    """
+    path = Path(path)
+    if path.suffix.lower() not in allowed:
+        raise ValueError(f"path: got {path.name!r}, its suffix must be one of {', '.join(allowed)}")
+    return path
+
+
+@contextmanager
+def replacing(path: Path) -> Iterator[Path]:
+    """A temporary path with the same suffix, which becomes ``path`` if the block succeeds and is removed if not."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    unfinished = path.with_name(f".{path.stem}.{os.getpid()}.tmp{path.suffix}")
+    try:
+        yield unfinished
+        os.replace(unfinished, path)
+    finally:
+        unfinished.unlink(missing_ok=True)
