@@ -16,7 +16,8 @@ SMOKE = {  # the whole program in under a minute; it learns nothing
 @dataclass
 class Config:
     """Train ReDiG on a team that crosses a narrow corridor in formation. Defaults differ from the paper's Table 3 where
-    its plain recipe does not survive online training; docs/paper.md says what and why."""
+    its plain recipe does not survive online training; docs/paper.md says what and why.
+    """
 
     out: Path | None = None
     """Folder of the run; default runs/FORMATION-seedSEED."""

@@ -98,7 +98,9 @@ def train(config: Config) -> dict[str, float]:
             save_policy(folder / f"{name}.safetensors", policy, policy_config, scenario)
 
     run.track(loss=loss, actor_optimizer=actor_optimizer, critic_optimizer=critic_optimizer, buffer=buffer)
-    run.track_state("collection", lambda: collection_state(env, collector), lambda s: set_collection_state(env, collector, s))
+    run.track_state(
+        "collection", lambda: collection_state(env, collector), lambda s: set_collection_state(env, collector, s)
+    )
     run.restore()
 
     # Clone the demonstrations, so that online training starts from a policy that reaches most goals
@@ -117,7 +119,10 @@ def train(config: Config) -> dict[str, float]:
 
     # Line 3: for each episode
     noise.sigma.fill_(config.exploration_noise)
-    rounds, interval = config.env_steps // config.collect_steps, max(1, config.evaluation_interval // config.collect_steps)
+    rounds, interval = (
+        config.env_steps // config.collect_steps,
+        max(1, config.evaluation_interval // config.collect_steps),
+    )
     for i in run.loop("online", rounds, checkpoint_every=interval):
         # Lines 4, 5 and 8: embed the team, sample actions, act, store the transitions
         started = time.perf_counter()

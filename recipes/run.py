@@ -29,6 +29,7 @@ from redig.checkpoint import (
     set_buffer_state,
     set_rng_state,
 )
+from redig.files import replacing
 
 LOGGERS = ("csv", "tensorboard", "wandb")
 
@@ -51,12 +52,15 @@ class Run:
     def __init__(self, folder: Path, config: Any, logger: str, resume: bool = False) -> None:
         check_logger(logger)
         if not resume and (folder / "config.json").exists():
-            raise FileExistsError(f"out: {folder} already holds a run; continue it with --resume {folder}, or choose another")
+            raise FileExistsError(
+                f"out: {folder} already holds a run; continue it with --resume {folder}, or choose another"
+            )
         self.folder = folder
         folder.mkdir(parents=True, exist_ok=True)
         self.saved: dict[str, Any] | None = load_checkpoint(folder / "checkpoint.pt") if resume else None
         if not resume:
-            write_json(folder / "config.json", asdict(config))
+            with replacing(folder / "config.json") as file:
+                file.write_text(json.dumps(asdict(config), indent=2, default=str) + "\n")
         self.counters: dict[str, int] = dict(self.saved["counters"]) if self.saved else {}
         self.evaluations: list[dict[str, Any]] = list(self.saved["evaluations"]) if self.saved else []
         self.best = self.saved["best"] if self.saved else -math.inf
@@ -111,7 +115,9 @@ class Run:
         finished, a checkpoint is written and the program exits.
         """
         previous = {s: signal.signal(s, lambda *_: self._stop.set()) for s in (signal.SIGINT, signal.SIGTERM)}
-        bar = tqdm(total=total, initial=self.counters.get(phase, 0), desc=phase, unit="it", disable=None, dynamic_ncols=True)
+        bar = tqdm(
+            total=total, initial=self.counters.get(phase, 0), desc=phase, unit="it", disable=None, dynamic_ncols=True
+        )
         try:
             while (step := self.counters.get(phase, 0)) < total:
                 yield step
@@ -143,14 +149,14 @@ class Run:
             "TT": metrics["travel_time"],
             "CFI": metrics["cfi_0.5"],
         }
-        values = {k: f"{metrics[k]:.3f}" for k in ("success_rate", "team_success_rate", "travel_time", "cfi_0.5", "jerk_mean")}
+        values = {
+            k: f"{metrics[k]:.3f}" for k in ("success_rate", "team_success_rate", "travel_time", "cfi_0.5", "jerk_mean")
+        }
         tqdm.write(f"{phase} after {updates} updates: {values}")
-        temporary = self.folder / "evaluations.csv.tmp"
-        with open(temporary, "w", newline="") as file:
+        with replacing(self.folder / "evaluations.csv") as path, open(path, "w", newline="") as file:
             writer = csv.DictWriter(file, fieldnames=list(self.evaluations[0]))
             writer.writeheader()
             writer.writerows(self.evaluations)
-        os.replace(temporary, self.folder / "evaluations.csv")
 
     def checkpoint(self) -> None:
         """Write the state of the run; a checkpoint is complete or not there at all."""
@@ -165,10 +171,3 @@ def check_logger(logger: str) -> None:
         raise ValueError(f"logger: got {logger!r}, allowed are {', '.join(LOGGERS)}")
     if logger != "csv" and importlib.util.find_spec(logger) is None:
         raise ImportError(f"logger: {logger} is not installed; install it with: pip install 'redig[{logger}]'")
-
-
-def write_json(path: Path, content: Any) -> None:
-    """Write JSON so that the file is never half written."""
-    temporary = path.with_name(path.name + ".tmp")
-    temporary.write_text(json.dumps(content, indent=2, default=str) + "\n")
-    os.replace(temporary, path)

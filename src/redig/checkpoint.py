@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 import pickle
 from pathlib import Path
 from typing import Any
@@ -14,6 +13,8 @@ from torchrl.data import ReplayBuffer
 from torchrl.envs import EnvBase
 from vmas.simulator.environment import Environment
 
+from redig.files import replacing
+
 
 def save_checkpoint(path: str | Path, state: dict[str, Any]) -> None:
     """Write nested dictionaries of tensors, numbers and strings; the file is replaced only by a complete one.
@@ -22,13 +23,8 @@ def save_checkpoint(path: str | Path, state: dict[str, Any]) -> None:
         path: of the file.
         state: what to save.
     """
-    path = Path(path)
-    temporary = path.with_name(path.name + ".tmp")
-    with open(temporary, "wb") as file:
+    with replacing(path) as file:
         torch.save(state, file)
-        file.flush()
-        os.fsync(file.fileno())
-    os.replace(temporary, path)
 
 
 def load_checkpoint(path: str | Path) -> dict[str, Any]:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import os
 from dataclasses import asdict, dataclass
 from pathlib import Path
 
@@ -13,6 +12,7 @@ from safetensors.torch import save
 from tensordict.nn import TensorDictModule, TensorDictSequential
 from torchrl.data import Bounded
 
+from redig.files import replacing
 from redig.modules import DDPM, DenoisingMLP, DiffusionActor, GraphEncoder, NoiseSchedule
 
 FORMAT = "redig-policy-1"
@@ -99,11 +99,10 @@ def save_policy(
         config: that made it.
         environment: arguments of the scenario that it was trained in, for those who evaluate it.
     """
-    path = Path(path)
     header = {"format": FORMAT, "policy": json.dumps(asdict(config)), "environment": json.dumps(environment or {})}
-    temporary = path.with_name(path.name + ".tmp")
-    temporary.write_bytes(save({k: v.detach().cpu().contiguous() for k, v in policy.state_dict().items()}, header))
-    os.replace(temporary, path)
+    weights = {key: value.detach().cpu().contiguous() for key, value in policy.state_dict().items()}
+    with replacing(path) as file:
+        file.write_bytes(save(weights, header))
 
 
 def read_header(path: str | Path) -> tuple[PolicyConfig, dict[str, object]]:

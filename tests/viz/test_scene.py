@@ -6,7 +6,7 @@ import torch
 from matplotlib.figure import Figure
 
 from redig.envs import FORMATIONS, ObstacleMap, formation_offsets
-from redig.viz.scene import PALETTE, draw_map, formation_outline, replacing, robot_style, view
+from redig.viz.scene import PALETTE, draw_map, formation_outline, robot_style, view
 
 
 @pytest.mark.parametrize("name", FORMATIONS)
@@ -48,14 +48,3 @@ def test_view_holds_motion_and_goals():
 def test_styles_of_robots_differ():
     styles = [robot_style(i) for i in range(2 * len(PALETTE))]
     assert len(set(styles)) == len(styles)
-
-
-def test_failed_drawing_keeps_the_old_file(tmp_path):
-    path = tmp_path / "figure.png"
-    path.write_text("old")
-    with pytest.raises(RuntimeError), replacing(path) as unfinished:
-        assert unfinished.suffix == ".png"
-        unfinished.write_text("half")
-        raise RuntimeError
-    assert path.read_text() == "old"
-    assert list(tmp_path.iterdir()) == [path]

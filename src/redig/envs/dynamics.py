@@ -45,7 +45,9 @@ def limit_norm(vector: Tensor, limit: float) -> Tensor:
     return vector * (limit / vector.norm(dim=-1, keepdim=True).clamp_min(limit))
 
 
-def separate(position: Tensor, velocity: Tensor, radius: float, distance: Tensor, direction: Tensor) -> tuple[Tensor, Tensor]:
+def separate(
+    position: Tensor, velocity: Tensor, radius: float, distance: Tensor, direction: Tensor
+) -> tuple[Tensor, Tensor]:
     """Push robots out of walls and out of each other, and stop their motion into a wall (rigid, inelastic contact).
 
     Args:

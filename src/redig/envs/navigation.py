@@ -114,7 +114,15 @@ class FormationNavigation(BaseScenario):
         self.collision_terminates = take("collision_terminates", False)
         self.arrival_terminates = take("arrival_terminates", True)
         self.hold_steps = take("hold_steps", 10)
-        positive = ("radius", "dt", "max_speed", "max_acceleration", "goal_radius", "proximity_margin", "start_distance")
+        positive = (
+            "radius",
+            "dt",
+            "max_speed",
+            "max_acceleration",
+            "goal_radius",
+            "proximity_margin",
+            "start_distance",
+        )
         for name in positive:
             if not getattr(self, name) > 0:
                 raise ValueError(f"{name}: got {getattr(self, name)}, must be greater than 0")
@@ -151,7 +159,9 @@ class FormationNavigation(BaseScenario):
         self.held[index] = 0
         for i, agent in enumerate(self.world.agents):
             agent.set_pos(start[:, i] if env_index is None else start[0, i], batch_index=env_index)
-            agent.set_vel(torch.zeros_like(agent.state.vel if env_index is None else start[0, i]), batch_index=env_index)
+            agent.set_vel(
+                torch.zeros_like(agent.state.vel if env_index is None else start[0, i]), batch_index=env_index
+            )
         self._measure(self._positions())
 
     def _formation_at(self, distance: float, batch: int) -> tuple[Tensor, Tensor]:

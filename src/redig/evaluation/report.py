@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import json
 import math
-import os
 from collections.abc import Mapping
 from pathlib import Path
+
+from redig.files import replacing
 
 UNITS = {"travel_time": "s", "jerk_mean": "m/s³", "jerk_peak": "m/s³"}
 
@@ -27,22 +28,16 @@ def format_table(metrics: Mapping[str, float]) -> str:
     return "\n".join(lines)
 
 
-def write_metrics(path: str | os.PathLike, metrics: Mapping[str, float]) -> None:
+def write_metrics(path: str | Path, metrics: Mapping[str, float]) -> None:
     """Write metrics as JSON, NaN as ``null``; a reader sees the old file or the new one, never half of it.
 
     Args:
         path: of the file; its folder is made if it is missing.
         metrics: such as those of :func:`~redig.evaluation.evaluate.evaluate`.
     """
-    path = Path(path)
-    path.parent.mkdir(parents=True, exist_ok=True)
     clean = {key: None if math.isnan(value) else value for key, value in metrics.items()}
-    unfinished = path.with_name(f".{path.name}.{os.getpid()}.tmp")
-    try:
-        unfinished.write_text(json.dumps(clean, indent=2, allow_nan=False) + "\n", encoding="utf-8")
-        os.replace(unfinished, path)
-    finally:
-        unfinished.unlink(missing_ok=True)
+    with replacing(path) as file:
+        file.write_text(json.dumps(clean, indent=2, allow_nan=False) + "\n", encoding="utf-8")
 
 
 def _number(value: float) -> str:

@@ -182,7 +182,9 @@ class DIPOLoss(LossModule):
         """Keys that a batch must have."""
         if self._in_keys is None:
             keys, first = self.tensor_keys, self.encoder_network if self.has_encoder else self.actor_network
-            states = list(dict.fromkeys([*first.in_keys, *(k for k in self.qvalue_network.in_keys if self._is_state(k))]))
+            states = list(
+                dict.fromkeys([*first.in_keys, *(k for k in self.qvalue_network.in_keys if self._is_state(k))])
+            )
             self._in_keys = [keys.action, *states, *(_under_next(k) for k in states)]
             self._in_keys += [_under_next(k) for k in (keys.reward, keys.done, keys.terminated)]
         return self._in_keys

@@ -5,7 +5,6 @@ from __future__ import annotations
 import hashlib
 import math
 import os
-import tempfile
 import warnings
 from pathlib import Path
 from typing import Any
@@ -18,6 +17,7 @@ from tqdm import tqdm
 
 from redig.envs.maps import ObstacleMap
 from redig.envs.seeding import preserve_rng_state
+from redig.files import replacing
 from redig.planning.astar import astar
 from redig.planning.grid import OccupancyGrid, occupancy_grid
 from redig.planning.rrt import rrt
@@ -221,17 +221,9 @@ def _plain_attributes(thing: object) -> dict:
 
 
 def _save(data: TensorDict, path: Path) -> None:
-    """Write to a temporary file first, so that no reader ever sees half a file."""
-    path.parent.mkdir(parents=True, exist_ok=True)
     flat: dict[str, Tensor] = data.cpu().flatten_keys("/").to_dict()
-    with tempfile.NamedTemporaryFile(dir=path.parent, suffix=".tmp", delete=False) as file:
-        try:
-            torch.save(flat, file)
-            file.close()
-            os.replace(file.name, path)
-        except BaseException:
-            os.unlink(file.name)
-            raise
+    with replacing(path) as file:
+        torch.save(flat, file)
 
 
 def _load(path: Path) -> TensorDict | None:

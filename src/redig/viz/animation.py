@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from redig.envs.maps import ObstacleMap
+from redig.files import replacing
 from redig.viz.scene import (
     INK,
     SHAPE,
@@ -24,7 +25,6 @@ from redig.viz.scene import (
     check_trajectory,
     draw_map,
     formation_outline,
-    replacing,
     robot_style,
     view,
 )

@@ -10,7 +10,8 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.ticker import MaxNLocator
 
-from redig.viz.scene import IMAGE_SUFFIXES, INK, PALETTE, check_suffix, replacing
+from redig.files import replacing
+from redig.viz.scene import IMAGE_SUFFIXES, INK, PALETTE, check_suffix
 
 DASHES = (0, (4, 3))
 Row = Mapping[str, float | None]

@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Iterator
-from contextlib import contextmanager
 from pathlib import Path
 
 import numpy as np
@@ -94,15 +92,3 @@ def check_suffix(path: str | os.PathLike, allowed: tuple[str, ...]) -> Path:
     if path.suffix.lower() not in allowed:
         raise ValueError(f"path: got {path.name!r}, its suffix must be one of {', '.join(allowed)}")
     return path
-
-
-@contextmanager
-def replacing(path: Path) -> Iterator[Path]:
-    """A temporary path with the same suffix, which becomes ``path`` if the block succeeds and is removed if not."""
-    path.parent.mkdir(parents=True, exist_ok=True)
-    unfinished = path.with_name(f".{path.stem}.{os.getpid()}.tmp{path.suffix}")
-    try:
-        yield unfinished
-        os.replace(unfinished, path)
-    finally:
-        unfinished.unlink(missing_ok=True)

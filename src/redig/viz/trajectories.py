@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from redig.envs.maps import ObstacleMap
+from redig.files import replacing
 from redig.viz.scene import (
     IMAGE_SUFFIXES,
     INK,
@@ -21,7 +22,6 @@ from redig.viz.scene import (
     check_trajectory,
     draw_map,
     formation_outline,
-    replacing,
     robot_style,
     view,
 )

@@ -1,0 +1,87 @@
+import math
+
+import pytest
+import torch
+from hypothesis import given
+from hypothesis import strategies as st
+from torch import nn
+
+from redig.modules import DenoisingMLP
+from redig.modules.denoiser import mlp, sinusoidal_embedding
+
+
+@given(st.floats(0, 1000), st.integers(1, 16))
+def test_sinusoidal_embedding_in_closed_form(step, half):
+    angles = [step * 10_000 ** (-i / max(half - 1, 1)) for i in range(half)]
+    expected = [math.sin(angle) for angle in angles] + [math.cos(angle) for angle in angles]
+    found = sinusoidal_embedding(torch.tensor(step, dtype=torch.float64), 2 * half)
+    torch.testing.assert_close(found, torch.tensor(expected, dtype=torch.float64), atol=2e-4, rtol=0)
+
+
+def test_sinusoidal_embedding_tells_the_steps_apart():
+    embedded = sinusoidal_embedding(torch.arange(100.0), 16)
+    assert embedded.shape == (100, 16)
+    assert (torch.cdist(embedded, embedded) + torch.eye(100)).min() > 0.05
+
+
+@pytest.mark.parametrize("batch", [(), (5,), (3, 4, 5)])
+def test_batch_shapes_agree_with_single_robots(batch):
+    torch.manual_seed(0)
+    denoiser = DenoisingMLP(2, 6, hidden=(16, 16), step_dim=4)
+    action, step, embedding = torch.randn(*batch, 2), torch.randint(100, batch), torch.randn(*batch, 6)
+    noise = denoiser(action, step, embedding)
+    assert noise.shape == action.shape
+    rows = zip(action.reshape(-1, 2), step.reshape(-1), embedding.reshape(-1, 6), strict=True)
+    expected = torch.stack([denoiser(*row) for row in rows])
+    torch.testing.assert_close(noise.reshape(-1, 2), expected)
+
+
+def test_scalar_step_counts_for_all_robots():
+    denoiser = DenoisingMLP(2, 6, hidden=(16,))
+    action, embedding = torch.randn(3, 5, 2), torch.randn(3, 5, 6)
+    everywhere = denoiser(action, torch.full((3, 5), 7), embedding)
+    torch.testing.assert_close(denoiser(action, torch.tensor(7), embedding), everywhere)
+
+
+def test_equals_the_layers_written_out():
+    denoiser = DenoisingMLP(2, 3, hidden=(8,), step_dim=4).double()
+    action, embedding = torch.randn(5, 2).double(), torch.randn(5, 3).double()
+    time = sinusoidal_embedding(torch.tensor(9.0, dtype=torch.float64), 4).expand(5, 4)
+    first, _, second = denoiser.net
+    hidden = torch.cat([action, time, embedding], -1) @ first.weight.T + first.bias
+    hidden = hidden * torch.tanh(torch.log1p(torch.exp(hidden)))  # Mish
+    torch.testing.assert_close(denoiser(action, torch.tensor(9), embedding), hidden @ second.weight.T + second.bias)
+
+
+def test_gradient_reaches_inputs_and_all_weights():
+    denoiser = DenoisingMLP(2, 6, hidden=(16, 16))
+    action, embedding = torch.randn(5, 2, requires_grad=True), torch.randn(5, 6, requires_grad=True)
+    denoiser(action, torch.arange(5), embedding).square().sum().backward()
+    for tensor in (action, embedding, *denoiser.parameters()):
+        assert tensor.grad.abs().max() > 0
+
+
+def test_mlp_layers():
+    def kinds(net):
+        return [type(layer) for layer in net]
+
+    assert kinds(mlp(3, (), 2)) == [nn.Linear]
+    assert kinds(mlp(3, (4, 5), 2, "relu")) == [nn.Linear, nn.ReLU, nn.Linear, nn.ReLU, nn.Linear]
+    normed = mlp(3, (4, 5), 2, "tanh", layer_norm=True)
+    assert kinds(normed) == [nn.Linear, nn.LayerNorm, nn.Tanh, nn.Linear, nn.LayerNorm, nn.Tanh, nn.Linear]
+    assert [(layer.in_features, layer.out_features) for layer in normed if isinstance(layer, nn.Linear)] == [
+        (3, 4),
+        (4, 5),
+        (5, 2),
+    ]
+
+
+@pytest.mark.parametrize("step_dim", [0, 1, 3])
+def test_bad_step_dim(step_dim):
+    with pytest.raises(ValueError, match=f"step_dim: got {step_dim}, must be even"):
+        DenoisingMLP(2, 6, step_dim=step_dim)
+
+
+def test_unknown_activation():
+    with pytest.raises(ValueError, match="activation: got 'gelu', allowed are mish, relu, silu, tanh"):
+        DenoisingMLP(2, 6, activation="gelu")
