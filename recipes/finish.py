@@ -35,9 +35,7 @@ def finish(run: Run, config: Config) -> dict[str, float]:
     others = {f"{name}_{key}": value for name in ("cloned", "last") for key, value in results[name].items()}
     write_metrics(run.folder / "metrics.json", {**metrics, **others})
     draw(run, config)
-    print(
-        f"\neverything is in {run.folder} ({platform.processor() or platform.machine()}, {torch.get_num_threads()} threads)"
-    )
+    print(f"\neverything is in {run.folder} ({platform.machine()}, {torch.get_num_threads()} threads)")
     return metrics
 
 

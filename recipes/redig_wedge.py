@@ -7,6 +7,7 @@ Run ``python recipes/redig_wedge.py``; everything goes into one folder under ``r
 from __future__ import annotations
 
 import time
+from functools import partial
 from pathlib import Path
 
 import torch
@@ -30,6 +31,7 @@ from redig.objectives import DIPOLoss, MultiStep
 from redig.planning import demonstrations
 from redig.policy import ACTION, EMBEDDING, OBSERVATION, PolicyConfig, build_encoder, build_policy, save_policy
 
+ARRIVED = ("agents", "info", "arrived")
 BASE_ACTION = ("agents", "policy_action")  # the policy's action before exploration noise
 VALIDATION_SEED = 1_000_000  # starts to choose the best policy on; training and final evaluation use others
 
@@ -99,7 +101,7 @@ def train(config: Config) -> dict[str, float]:
 
     run.track(loss=loss, actor_optimizer=actor_optimizer, critic_optimizer=critic_optimizer, buffer=buffer)
     run.track_state(
-        "collection", lambda: collection_state(env, collector), lambda s: set_collection_state(env, collector, s)
+        "collection", partial(collection_state, env, collector), partial(set_collection_state, env, collector)
     )
     run.restore()
 
@@ -119,10 +121,8 @@ def train(config: Config) -> dict[str, float]:
 
     # Line 3: for each episode
     noise.sigma.fill_(config.exploration_noise)
-    rounds, interval = (
-        config.env_steps // config.collect_steps,
-        max(1, config.evaluation_interval // config.collect_steps),
-    )
+    rounds = config.env_steps // config.collect_steps
+    interval = max(1, config.evaluation_interval // config.collect_steps)
     for i in run.loop("online", rounds, checkpoint_every=interval):
         # Lines 4, 5 and 8: embed the team, sample actions, act, store the transitions
         started = time.perf_counter()
@@ -144,9 +144,6 @@ def train(config: Config) -> dict[str, float]:
 
     # Line 15: return the policy
     return finish(run, config)
-
-
-ARRIVED = ("agents", "info", "arrived")
 
 
 def transitions(data: TensorDictBase, demonstration: bool = False) -> TensorDictBase:

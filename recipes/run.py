@@ -111,8 +111,8 @@ class Run:
     def loop(self, phase: str, total: int, checkpoint_every: int | None = None) -> Iterator[int]:
         """Count ``phase`` up to ``total`` from where the checkpoint left it, with a progress bar.
 
-        A checkpoint is written every ``checkpoint_every`` steps and at the end. On Ctrl-C or SIGTERM the current step is
-        finished, a checkpoint is written and the program exits.
+        A checkpoint is written every ``checkpoint_every`` steps and at the end. On Ctrl-C or SIGTERM the current step
+        is finished, a checkpoint is written and the program exits.
         """
         previous = {s: signal.signal(s, lambda *_: self._stop.set()) for s in (signal.SIGINT, signal.SIGTERM)}
         bar = tqdm(
@@ -149,10 +149,8 @@ class Run:
             "TT": metrics["travel_time"],
             "CFI": metrics["cfi_0.5"],
         }
-        values = {
-            k: f"{metrics[k]:.3f}" for k in ("success_rate", "team_success_rate", "travel_time", "cfi_0.5", "jerk_mean")
-        }
-        tqdm.write(f"{phase} after {updates} updates: {values}")
+        shown = ("success_rate", "team_success_rate", "travel_time", "cfi_0.5", "jerk_mean")
+        tqdm.write(f"{phase}, {updates} updates: " + ", ".join(f"{name} {metrics[name]:.3f}" for name in shown))
         with replacing(self.folder / "evaluations.csv") as path, open(path, "w", newline="") as file:
             writer = csv.DictWriter(file, fieldnames=list(self.evaluations[0]))
             writer.writeheader()

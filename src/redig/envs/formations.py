@@ -69,8 +69,8 @@ def pairwise_distances(position: Tensor) -> Tensor:
 def formation_integrity(name: str, position: Tensor, literal: bool = False) -> Tensor:
     """Tau of the contextual formation integrity (Appendix F.5): how well the team keeps its shape, in [0, 1].
 
-    It measures proportions, not size, so a shape that is squeezed evenly keeps it. The printed formulas for circle and
-    line are wrong (``docs/paper.md``); the corrected ones are the default and ``literal=True`` gives those of the paper.
+    It measures proportions, not size, so a wedge or line that is squeezed evenly keeps it. The printed formulas for
+    circle and line are wrong (``docs/paper.md``); the corrected ones are the default, ``literal=True`` gives the paper's.
 
     Args:
         name: formation name, see :func:`formation_offsets`.
@@ -109,7 +109,7 @@ def _circle_integrity(position: Tensor, literal: bool) -> Tensor:
 
 
 def _wedge_integrity(position: Tensor) -> Tensor:
-    """1 - 2|L_l - L_r|/(L_l + L_r) - mean_k |L_k m/k - L_b|/L_b over the inner pairs k < m (the paper's middle side)."""
+    """1 - 2|L_l - L_r|/(L_l + L_r) - mean_k |L_k m/k - L_b|/L_b over inner pairs k < m (the paper's middle side)."""
     n = position.shape[-2]
     apex, left, right = position[..., :1, :], position[..., 1::2, :], position[..., 2::2, :]
     m = (n - 1) // 2  # complete pairs; with an even n the last robot on the left has no partner

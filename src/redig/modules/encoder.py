@@ -55,7 +55,7 @@ class GraphEncoder(nn.Module):
     ``W^h (I - L) z`` with the graph Laplacian ``L``. ``activation`` then acts on ``z`` and ``h`` (``None``: exactly as
     printed).
 
-    Works for any number of robots; a robot without neighbours gets an aggregate of zero. Equivariant under permutations.
+    Works for any number of robots; one without neighbours gets an aggregate of zero. Equivariant under permutations.
 
     Args:
         in_features: width of a robot's state (7 in the paper, 9 with the direction to the nearest obstacle).

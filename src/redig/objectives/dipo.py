@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import ClassVar
 
 import torch
 from tensordict import TensorDict, TensorDictBase, TensorDictParams
@@ -25,12 +26,12 @@ REFINE_FROM = ("stored", "policy")
 class DIPOLoss(LossModule):
     """Diffusion policy improvement (Yang et al., 2023) on graph embeddings: lines 9 to 13 of Algorithm 1.
 
-    * ``loss_qvalue`` (Eq. 2): TD error of the twin critics, ``y = r + gamma min(Q1', Q2')(h', a')`` with target networks
-      and ``a'`` from the target actor.
+    * ``loss_qvalue`` (Eq. 2): TD error of the twin critics, ``y = r + gamma min(Q1', Q2')(h', a')`` with target
+      networks and ``a'`` from the target actor.
     * refinement (Sec. 3.2.2): ``a <- a + eta grad_a min(Q1, Q2)(h, a)``, ``refine_steps`` times.
     * ``loss_actor`` (Eq. 1): diffusion loss of the actor on the refined actions.
 
-    Rewards and done flags may be per robot, ``[*B, n, 1]``, or per team, ``[*B, 1]``; a team's flag counts for each robot.
+    Rewards and done flags may be per robot, ``[*B, n, 1]``, or per team, ``[*B, 1]``; a team's count for each robot.
 
     Args:
         encoder: TensorDictModule that writes the embedding which the actor reads, or ``None`` if actor and critic read
@@ -39,8 +40,8 @@ class DIPOLoss(LossModule):
         qvalue: TensorDictModule ``(embedding, action) -> state_action_value``; copied ``num_qvalue_nets`` times.
 
     Keyword Args:
-        critic_encoder: an encoder of the critic's own (same keys). Default ``None``: one encoder, trained by both losses
-            as in the paper.
+        critic_encoder: an encoder of the critic's own (same keys). Default ``None``: one encoder, trained by both
+            losses as in the paper.
         detach_encoder: keep the critic's loss from reaching the shared encoder.
         num_qvalue_nets: number of critics.
         refine_steps: number of gradient steps on the action; 0 turns refinement off (behaviour cloning).
@@ -67,12 +68,15 @@ class DIPOLoss(LossModule):
         >>> from torchrl.data import Bounded
         >>> from redig.modules import DenoisingMLP, DiffusionActor, GraphEncoder, QNetwork
         >>> encoder = TensorDictModule(GraphEncoder(9), in_keys=["observation"], out_keys=["embedding"])
-        >>> actor = DiffusionActor(DenoisingMLP(2, 64), Bounded(-1, 1, (5, 2)), in_keys=["embedding"], out_keys=["action"])
+        >>> spec = Bounded(-1, 1, (5, 2))
+        >>> actor = DiffusionActor(DenoisingMLP(2, 64), spec, in_keys=["embedding"], out_keys=["action"])
         >>> qvalue = TensorDictModule(QNetwork(64, 2), in_keys=["embedding", "action"], out_keys=["state_action_value"])
         >>> loss = DIPOLoss(encoder, actor, qvalue, refine_steps=1)
         >>> flag = torch.zeros(8, 5, 1, dtype=torch.bool)
-        >>> data = TensorDict({"observation": torch.randn(8, 5, 9), "action": torch.zeros(8, 5, 2), "next": {
-        ...     "observation": torch.randn(8, 5, 9), "reward": torch.ones(8, 5, 1), "done": flag, "terminated": flag}}, [8])
+        >>> following = {"reward": torch.ones(8, 5, 1), "done": flag, "terminated": flag}
+        >>> following["observation"] = torch.randn(8, 5, 9)
+        >>> data = {"observation": torch.randn(8, 5, 9), "action": torch.zeros(8, 5, 2), "next": following}
+        >>> data = TensorDict(data, [8])
         >>> sorted(key for key in loss(data).keys() if key.startswith("loss"))
         ['loss_actor', 'loss_qvalue']
     """
@@ -90,8 +94,8 @@ class DIPOLoss(LossModule):
             reward, done, terminated: under ``"next"``.
             priority: where the TD error is written.
             demonstration: flag of transitions to imitate as they are.
-            actor_mask: optional flag ``[*B, n, 1]`` of the robots whose action counts for the actor; false for one whose
-                action the environment did not carry out, such as a robot that has arrived and holds.
+            actor_mask: optional flag ``[*B, n, 1]`` of the robots whose action counts for the actor; false for one
+                whose action the environment did not carry out, such as a robot that has arrived and holds.
             steps_to_next_obs: length of n-step windows.
         """
 
@@ -113,7 +117,14 @@ class DIPOLoss(LossModule):
     default_value_estimator = ValueEstimators.TD0
     # a diffusion target policy that starts from a zero latent is not the policy: sample it
     deterministic_sampling_mode = ExplorationType.RANDOM
-    out_keys = ["loss_qvalue", "loss_actor", "pred_value", "target_value", "next_state_value", "refine_distance"]
+    out_keys: ClassVar[list[NestedKey]] = [
+        "loss_qvalue",
+        "loss_actor",
+        "pred_value",
+        "target_value",
+        "next_state_value",
+        "refine_distance",
+    ]
 
     encoder_network: TensorDictModule
     encoder_network_params: TensorDictParams

@@ -12,9 +12,9 @@ class MultiStep:
     """Turn trajectories into n-step transitions, robot by robot; use it as a collector's ``postproc``.
 
     TorchRL's own ``MultiStep`` knows one done flag a transition. In a team a robot may be done (it has collided) while
-    its team drives on: its return must end there, while its teammates' graph n steps later still contains it. So rewards
-    are summed until the robot's own termination, and the next observation is the team's, n steps later or at the
-    episode's end (or at the end of the given piece of trajectory, with a shorter window).
+    its team drives on: its return must end there, while its teammates' graph n steps later still contains it. So
+    rewards are summed until the robot's own termination, and the next observation is the team's, n steps later or at
+    the episode's end (or at the end of the given piece of trajectory, with a shorter window).
 
     Args:
         n_steps: length of the window.
@@ -33,8 +33,9 @@ class MultiStep:
         >>> import torch
         >>> from tensordict import TensorDict
         >>> zeros = torch.zeros(1, 3, 2, 1)
-        >>> data = TensorDict({"agents": {"observation": zeros}, "next": {"agents": {"observation": zeros,
-        ...     "reward": zeros + 1, "info": {"terminated": zeros}}, "done": torch.zeros(1, 3, 1, dtype=torch.bool)}}, [1, 3])
+        >>> following = {"observation": zeros, "reward": zeros + 1, "info": {"terminated": zeros}}
+        >>> following = {"agents": following, "done": torch.zeros(1, 3, 1, dtype=torch.bool)}
+        >>> data = TensorDict({"agents": {"observation": zeros}, "next": following}, [1, 3])
         >>> out = MultiStep(n_steps=2, gamma=0.5, keep=[("agents", "observation")])(data)
         >>> out["next", "agents", "reward"][0, :, 0, 0]
         tensor([1.5000, 1.5000, 1.0000])

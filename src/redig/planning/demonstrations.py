@@ -67,8 +67,8 @@ def demonstrations(
         cache_dir: folder for a file named after the hash of everything that made it; ``None`` keeps nothing.
 
     Returns:
-        TensorDict ``[episodes, T]`` with the environment's keys for observation, action, arrived, next observation, next reward,
-        next ``collision``, ``arrived`` and ``terminated``, next ``done``, ``terminated`` and ``truncated`` (where the
+        TensorDict ``[episodes, T]`` with the environment's keys for observation, action, arrived, next observation,
+        next reward, next ``collision``, ``arrived`` and ``terminated``, next ``done``, ``terminated`` and ``truncated`` (where the
         environment has them), and ``mask``: True up to and including the step in which a team is done; what follows
         is padding.
 
