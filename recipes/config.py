@@ -107,22 +107,24 @@ class Config:
     """Discount factor (paper: 0.99)."""
     tau: float = 0.01
     """Rate of the target networks (paper: 0.005)."""
-    critic_lr: float = 1e-3
+    critic_lr: float = 5e-4
     """Learning rate of the critics (paper: 3e-4)."""
     actor_lr: float = 3e-4
     """Learning rate of encoder and denoiser."""
-    final_lr: float = 1.0
+    final_lr: float = 0.1
     """Share of both learning rates that is left at the end; they fall linearly."""
     grad_norm: float = 2.0
     """Limit on the norm of gradients."""
     refine_steps: int = 1
     """Gradient steps on each action."""
-    refine_step_size: float = 0.5
+    refine_step_size: float = 0.3
     """Eta of the action refinement."""
-    refine_max_norm: float | None = None
+    refine_max_norm: float | None = 0.1
     """Limit on how far refinement moves an action (m/s)."""
     refine_from: str = "stored"
     """Refine the stored action (DIPO) or one freshly sampled from the policy (Algorithm 1 as printed)."""
+    act_with_target: bool = True
+    """Act and evaluate with the target policy, the Polyak average of the one that learns."""
     exploration_noise: float = 0.15
     """Standard deviation of the noise on executed commands (m/s)."""
     warmup_noise: float = 0.3
@@ -147,6 +149,8 @@ class Config:
     """Width of the three hidden layers of denoiser and critics (paper: 256)."""
     layer_norm: bool = True
     """LayerNorm in the critics."""
+    critic_activation: str = "relu"
+    """Nonlinearity of the critics (paper: mish, which costs a quarter more time)."""
     diffusion_steps: int = 100
     """K."""
     schedule: str = "cosine"

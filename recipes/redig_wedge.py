@@ -51,8 +51,9 @@ def train(config: Config) -> dict[str, float]:
 
     # Line 1: initialise phi, psi, Q1 and Q2
     policy_config = policy_architecture(config, env.observation_spec[OBSERVATION].shape[-1])
-    policy = build_policy(policy_config)
-    loss = make_loss(config, policy_config, policy)
+    learner = build_policy(policy_config)
+    loss = make_loss(config, policy_config, learner)
+    policy = averaged_policy(loss, policy_config) if config.act_with_target else learner
     target = SoftUpdate(loss, tau=config.tau)
     actor_optimizer, critic_optimizer = make_optimizers(config, loss)
 
@@ -177,12 +178,12 @@ def policy_architecture(config: Config, observation_dim: int) -> PolicyConfig:
     )
 
 
-def make_loss(config: Config, architecture: PolicyConfig, policy: TensorDictSequential) -> DIPOLoss:
-    """Twin critics and the DIPO loss around a policy."""
+def make_loss(config: Config, architecture: PolicyConfig, learner: TensorDictSequential) -> DIPOLoss:
+    """Twin critics and the DIPO loss around the policy that learns."""
     value = ("agents", "state_action_value")
-    critic = QNetwork(architecture.embedding_dim, 2, architecture.hidden, config.layer_norm)
+    critic = QNetwork(architecture.embedding_dim, 2, architecture.hidden, config.layer_norm, config.critic_activation)
     loss = DIPOLoss(
-        *policy,
+        *learner,
         TensorDictModule(critic, in_keys=[EMBEDDING, ACTION], out_keys=[value]),
         critic_encoder=None if config.shared_encoder else build_encoder(architecture),
         detach_encoder=config.detach_encoder,
@@ -208,7 +209,7 @@ def make_optimizers(config: Config, loss: DIPOLoss) -> tuple[torch.optim.Optimiz
 
     def adam(rate: float, *networks: str) -> torch.optim.Optimizer:
         wanted = tuple(f"{network}_params" for network in networks)
-        return torch.optim.Adam([p for name, p in loss.named_parameters() if name.startswith(wanted)], rate)
+        return torch.optim.Adam([p for name, p in loss.named_parameters() if name.startswith(wanted)], rate, fused=True)
 
     return (
         adam(config.actor_lr, "encoder_network", "actor_network"),
@@ -220,6 +221,14 @@ def learning_rate(optimizer: torch.optim.Optimizer, rate: float) -> None:
     """Set the learning rate of an optimizer."""
     for group in optimizer.param_groups:
         group["lr"] = rate
+
+
+def averaged_policy(loss: DIPOLoss, architecture: PolicyConfig) -> TensorDictSequential:
+    """The policy with the target networks' weights: the Polyak average of the learner, which is far steadier."""
+    policy = build_policy(architecture)
+    loss.target_encoder_network_params.to_module(policy[0])
+    loss.target_actor_network_params.to_module(policy[1])
+    return policy
 
 
 def copy_to_targets(loss: DIPOLoss) -> None:

@@ -87,16 +87,25 @@ def test_reward_weights_and_variants_against_positions_and_velocities():
         return info_of(run(short_trip(2, arrival_bonus=3.0, **kwargs), 12))
 
     desired = pairwise_distances(formation_offsets("wedge", 5))
-    info = rollout(formation_weight=0.25, omega=0.5)
+    info = rollout(formation_weight=0.25, omega=0.7)
     position, velocity = info["position"], info["velocity"]
-    pairs = 0.5 * (desired - pairwise_distances(position)).abs() + 0.5 * pairwise_distances(velocity)
-    expected = -0.25 * pairs.sum((-2, -1)).unsqueeze(-1).expand(-1, -1, 5)
-    torch.testing.assert_close(info["formation_reward"], expected, atol=1e-5, rtol=0)
+    spring, damper = (desired - pairwise_distances(position)).abs(), pairwise_distances(velocity)
+    team = -0.25 * (0.7 * spring + 0.3 * damper).sum((-2, -1))
+    torch.testing.assert_close(info["formation_reward"], team.unsqueeze(-1).expand(-1, -1, 5), atol=1e-5, rtol=0)
     moving = 1 - info["arrived"].roll(1, 1).index_fill(1, torch.tensor([0]), 0)  # not arrived before this step
     goal = 0.25 * torch.tensor([1.0, 0.0]) + formation_offsets("wedge", 5)
     away = goal - position
     expected = (velocity * away / away.norm(dim=-1, keepdim=True)).sum(-1) * velocity.norm(dim=-1)
     torch.testing.assert_close(info["navigation_reward"], expected * moving, atol=1e-4, rtol=0)
+
+    info = rollout(formation_reward="spring_damper_bonus", formation_weight=0.25, omega=0.7)
+    pairs = 1 - (desired - pairwise_distances(info["position"])).abs().clamp_max(1)
+    pairs = pairs - 0.3 / 0.7 * pairwise_distances(info["velocity"])
+    expected = 0.25 * (pairs.sum(-1) - 1) / 4  # less the pair of a robot with itself
+    torch.testing.assert_close(info["formation_reward"], expected, atol=1e-5, rtol=0)
+
+    info = rollout(formation_reward="scaled", formation_weight=0.25)  # the team moves as one, in formation
+    torch.testing.assert_close(info["formation_reward"], torch.full((2, 12, 5), 0.25), atol=1e-3, rtol=0)
 
     info = rollout(navigation_reward="progress")
     gained = (info["navigation_reward"] * 0.1).sum(1)
@@ -302,7 +311,10 @@ def test_a_reset_environment_starts_its_arrivals_anew():
     before = run(env, 25)[:, -1]
     assert before["agents", "info", "arrived"].all()
     before["_reset"] = torch.tensor([[True], [False]])
+    held = env.base_env.scenario.held[1].item()
     after = env.reset(before.clone())
+    assert held > 0
+    assert env.base_env.scenario.held.tolist() == [0, held]
     assert not after["agents", "info", "arrived"][0].any()
     assert after["agents", "info", "arrived"][1].all()
     assert not step(env, after, torch.zeros(2, 5, 2))["agents", "info", "arrived"][0].any()

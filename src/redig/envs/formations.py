@@ -70,7 +70,7 @@ def formation_integrity(name: str, position: Tensor, literal: bool = False) -> T
     """Tau of the contextual formation integrity (Appendix F.5): how well the team keeps its shape, in [0, 1].
 
     It measures proportions, not size, so a wedge or line that is squeezed evenly keeps it. The printed formulas for
-    circle and line are wrong (``docs/paper.md``); the corrected ones are the default, ``literal=True`` gives the paper's.
+    circle and line are wrong (``docs/paper.md``); the corrected ones are the default, ``literal=True`` gives those.
 
     Args:
         name: formation name, see :func:`formation_offsets`.

@@ -68,9 +68,9 @@ def demonstrations(
 
     Returns:
         TensorDict ``[episodes, T]`` with the environment's keys for observation, action, arrived, next observation,
-        next reward, next ``collision``, ``arrived`` and ``terminated``, next ``done``, ``terminated`` and ``truncated`` (where the
-        environment has them), and ``mask``: True up to and including the step in which a team is done; what follows
-        is padding.
+        next reward, next ``collision``, ``arrived`` and ``terminated``, next ``done``, ``terminated`` and ``truncated``
+        (where the environment has them), and ``mask``: True up to and including the step in which a team is done; what
+        follows is padding.
 
     Raises:
         ValueError: for an unknown planner, an argument out of range, or a goal that no plan reaches.
