@@ -65,6 +65,7 @@ def train(config: Config) -> dict[str, float]:
     demos = transitions(multi_step(episodes)[episodes["mask"]], demonstration=True)
     buffer = TensorDictReplayBuffer(storage=LazyTensorStorage(config.buffer_size))
 
+    env.set_seed(config.seed)  # VMAS has one random state for all environments: seed after the last is built
     noise = AdditiveGaussianModule(env.action_spec, config.warmup_noise, config.warmup_noise, action_key=ACTION)
     keep_base = TensorDictModule(torch.clone, in_keys=[ACTION], out_keys=[BASE_ACTION])
     collector = Collector(

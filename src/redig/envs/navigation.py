@@ -226,14 +226,15 @@ class FormationNavigation(BaseScenario):
 
     def _formation_reward(self, position: Tensor, velocity: Tensor) -> Tensor:
         if self.formation_reward == "scaled":
-            team = rewards.scaled_formation_bonus(position, self.offsets, self.direction)
+            bonus = rewards.scaled_formation_bonus(position, self.offsets, self.direction)
+        elif self.formation_reward == "spring_damper_bonus":
+            bonus = rewards.spring_damper_bonus(position, velocity, self.desired, self.omega)
         elif self.formation_reward == "spring_damper":
             team = rewards.spring_damper(position, velocity, self.desired, self.omega)
-        elif self.formation_reward == "spring_damper_bonus":
-            return self.formation_weight * rewards.spring_damper_bonus(position, velocity, self.desired, self.omega)
+            bonus = team.unsqueeze(-1).expand(-1, self.n_robots)
         else:
-            team = position.new_zeros(position.shape[0])
-        return self.formation_weight * team.unsqueeze(-1).expand(-1, self.n_robots)
+            bonus = position.new_zeros(position.shape[:2])
+        return self.formation_weight * bonus
 
     def _measure(
         self,

@@ -77,7 +77,8 @@ def best_lateral_scale(
         limits: smallest and largest scale.
 
     Returns:
-        scale ``[*B]`` and residual ``[*B, n]`` (m).
+        scale ``[*B]`` and residual ``[*B, n]`` (m), measured after stretching the team back to full width: a formation
+        squeezed to a third must be kept three times as precisely across, as its proportions demand.
     """
     relative = position - position.mean(-2, keepdim=True)
     direction = direction.unsqueeze(-2)
@@ -85,7 +86,7 @@ def best_lateral_scale(
     left = relative[..., 1] * direction[..., 0] - relative[..., 0] * direction[..., 1]
     scale = (left * offsets[:, 1]).sum(-1) / offsets[:, 1].square().sum()
     scale = scale.clamp(*limits)
-    error = torch.stack([forward - offsets[:, 0], left - scale.unsqueeze(-1) * offsets[:, 1]], -1)
+    error = torch.stack([forward - offsets[:, 0], left / scale.unsqueeze(-1) - offsets[:, 1]], -1)
     return scale, error.norm(dim=-1)
 
 
@@ -99,30 +100,30 @@ def scaled_formation_bonus(
 ) -> Tensor:
     """Formation against the best lateral scaling of the shape: a squeezed formation counts as whole, and costs little.
 
-    ``1 - min(mean_i residual_i / tolerance, 1) - squeeze_cost * max(1 - s, 0)``, see :func:`best_lateral_scale`. The
-    spring term compares absolute distances while the CFI compares proportions; inside a corridor the two disagree, and
+    ``1 - min(residual_i / tolerance, 1) - squeeze_cost * max(1 - s, 0)``, see :func:`best_lateral_scale`. The spring
+    term compares absolute distances while the CFI compares proportions; inside a corridor the two disagree, and
     this form sides with the CFI.
 
     Args:
         position: ``[*B, n, 2]`` (m).
         offsets: the formation ``[n, 2]`` (m).
         direction: unit vector of travel ``[*B, 2]``.
-        tolerance: mean residual (m) at which the bonus is gone.
+        tolerance: residual (m) at which a robot's bonus is gone.
         squeeze_cost: price of a formation squeezed to nothing; it makes the team spread again behind the corridor.
         limits: smallest and largest lateral scale.
 
     Returns:
-        reward ``[*B]`` of the team, at most 1.
+        reward ``[*B, n]``, at most 1.
 
     Examples:
         >>> import torch
         >>> from redig.envs.formations import formation_offsets
         >>> wedge = formation_offsets("wedge", 5)
-        >>> scaled_formation_bonus(wedge, wedge, torch.tensor([1.0, 0.0])).item()
-        1.0
+        >>> scaled_formation_bonus(wedge, wedge, torch.tensor([1.0, 0.0])).round(decimals=4)
+        tensor([1., 1., 1., 1., 1.])
     """
     scale, residual = best_lateral_scale(position, offsets, direction, limits)
-    return 1 - (residual.mean(-1) / tolerance).clamp_max(1) - squeeze_cost * (1 - scale).clamp_min(0)
+    return 1 - (residual / tolerance).clamp_max(1) - squeeze_cost * (1 - scale).clamp_min(0).unsqueeze(-1)
 
 
 def goal_speed(position: Tensor, velocity: Tensor, goal: Tensor) -> Tensor:
