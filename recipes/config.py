@@ -6,8 +6,10 @@ import dataclasses
 import json
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
-SMOKE = {  # the whole program in under a minute; it learns nothing
+FORMATION_WEIGHT = {"wedge": 3.0, "line": 2.0, "circle": 2.0}  # too much, and a team stands still in perfect formation
+SMOKE: dict[str, Any] = {  # the whole program in under a minute; it learns nothing
     "num_trajectories": 100, "clone_updates": 20, "critic_updates": 10, "warmup_steps": 20, "env_steps": 40,
     "evaluation_interval": 20, "evaluation_starts": 8, "num_starts": 8, "num_envs": 8, "hidden": 32,
 }  # fmt: skip
@@ -53,8 +55,8 @@ class Config:
     # the reward
     formation_reward: str = "scaled"
     """scaled, spring_damper_bonus, spring_damper (Eq. 29) or none."""
-    formation_weight: float = 2.0
-    """Weight of the formation reward against progress in m/s."""
+    formation_weight: float | None = None
+    """Weight of the formation reward against progress in m/s; default: what suits the formation."""
     omega: float = 0.8
     """Balance of spring and damper in the spring-damper forms (paper: 0.5)."""
     navigation_reward: str = "progress"
@@ -168,7 +170,7 @@ class Config:
     num_starts: int = 256
     """Starts of the final evaluation, never trained on and never used for a choice."""
 
-    def scenario(self) -> dict[str, object]:
+    def scenario(self) -> dict[str, Any]:
         """Arguments of :class:`redig.envs.FormationNavigation`."""
         names = (
             "formation", "n_robots", "formation_width", "corridor_width", "corridor_length", "max_speed",
@@ -192,6 +194,8 @@ class Config:
             saved = json.loads(path.read_text())
             return dataclasses.replace(Config(**saved), resume=self.resume, out=None)
         config = dataclasses.replace(self, **SMOKE) if self.smoke else self
+        if config.formation_weight is None:
+            config = dataclasses.replace(config, formation_weight=FORMATION_WEIGHT.get(config.formation, 1.0))
         for name in (
             "num_trajectories", "clone_updates", "clone_batch", "num_envs", "collect_steps", "updates_per_step",
             "batch_size", "buffer_size", "evaluation_interval", "evaluation_starts", "num_starts", "hidden",

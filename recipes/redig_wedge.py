@@ -184,7 +184,8 @@ def make_loss(config: Config, architecture: PolicyConfig, learner: TensorDictSeq
     value = ("agents", "state_action_value")
     critic = QNetwork(architecture.embedding_dim, 2, architecture.hidden, config.layer_norm, config.critic_activation)
     loss = DIPOLoss(
-        *learner,
+        learner[0],
+        learner[1],
         TensorDictModule(critic, in_keys=[EMBEDDING, ACTION], out_keys=[value]),
         critic_encoder=None if config.shared_encoder else build_encoder(architecture),
         detach_encoder=config.detach_encoder,

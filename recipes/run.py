@@ -41,7 +41,7 @@ class Run:
         folder: where everything goes; it must not hold another run, unless ``resume`` is true.
         config: a dataclass instance, written as ``config.json``.
         logger: one of ``csv``, ``tensorboard``, ``wandb``.
-        resume: continue from the checkpoint in the folder.
+        resume: continue from the checkpoint in the folder, or from the start if there is none yet.
 
     Raises:
         ValueError: for an unknown logger.
@@ -57,7 +57,8 @@ class Run:
             )
         self.folder = folder
         folder.mkdir(parents=True, exist_ok=True)
-        self.saved: dict[str, Any] | None = load_checkpoint(folder / "checkpoint.pt") if resume else None
+        checkpoint = folder / "checkpoint.pt"  # a run killed before its first one starts again
+        self.saved: dict[str, Any] | None = load_checkpoint(checkpoint) if resume and checkpoint.exists() else None
         if not resume:
             with replacing(folder / "config.json") as file:
                 file.write_text(json.dumps(asdict(config), indent=2, default=str) + "\n")
@@ -76,7 +77,7 @@ class Run:
             if isinstance(part, ReplayBuffer):
                 self.track_state(name, partial(buffer_state, part), partial(set_buffer_state, part))
             else:
-                self.track_state(name, lambda part=part: dict(part.state_dict()), part.load_state_dict)
+                self.track_state(name, partial(_plain_state, part), part.load_state_dict)
 
     def track_state(self, name: str, get: Callable[[], Any], put: Callable[[Any], object]) -> None:
         """Keep in the checkpoint what ``get`` returns; ``put`` restores it."""
@@ -161,6 +162,10 @@ class Run:
         progress = {"counters": self.counters, "evaluations": self.evaluations, "best": self.best}
         state = {name: get() for name, (get, _) in self._tracked.items()}
         save_checkpoint(self.folder / "checkpoint.pt", {**progress, **state, "rng": rng_state()})
+
+
+def _plain_state(part: Any) -> dict[str, Any]:
+    return dict(part.state_dict())
 
 
 def check_logger(logger: str) -> None:

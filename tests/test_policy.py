@@ -1,6 +1,7 @@
 import json
 import os
 import pickle
+import re
 from dataclasses import asdict, replace
 
 import pytest
@@ -127,7 +128,7 @@ class Bomb:
 def test_pickle_in_disguise_is_refused_and_not_executed(write, tmp_path):
     path = tmp_path / "policy.safetensors"
     write({"weights": Bomb()}, path)
-    with pytest.raises(ValueError, match=f"{path} is not a safetensors file"):
+    with pytest.raises(ValueError, match=re.escape(f"{path} is not a safetensors file")):
         load_policy(path)
     assert not Bomb.exploded
 
@@ -137,7 +138,7 @@ def test_truncated_file(saved, part):
     path, _ = saved
     content = path.read_bytes()
     path.write_bytes(content[: int(part * len(content))])
-    with pytest.raises(ValueError, match=f"{path} is not a safetensors file, or is damaged"):
+    with pytest.raises(ValueError, match=re.escape(f"{path} is not a safetensors file, or is damaged")):
         load_policy(path)
 
 
@@ -145,7 +146,7 @@ def test_truncated_file(saved, part):
 def test_other_format(saved, format_):
     path, policy = saved
     written(path, policy.state_dict(), format=format_)
-    with pytest.raises(ValueError, match=rf"{path} has format {format_!r}, expected 'redig-policy-1'"):
+    with pytest.raises(ValueError, match=re.escape(f"{path} has format {format_!r}, expected 'redig-policy-1'")):
         load_policy(path)
 
 
@@ -171,7 +172,7 @@ def test_safetensors_without_header(saved):
 def test_header_that_does_not_fit(saved, changes):
     path, policy = saved
     written(path, policy.state_dict(), **changes)
-    with pytest.raises(ValueError, match=f"{path}"):
+    with pytest.raises(ValueError, match=re.escape(str(path))):
         load_policy(path)
 
 
@@ -180,7 +181,7 @@ def test_missing_weights(saved):
     weights = policy.state_dict()
     weights.pop(next(iter(weights)))
     written(path, weights)
-    with pytest.raises(ValueError, match=f"{path}"):
+    with pytest.raises(ValueError, match=re.escape(str(path))):
         load_policy(path)
 
 
@@ -193,7 +194,7 @@ def test_wrong_observation_width_names_both(saved):
 
 def test_missing_file(tmp_path):
     for path in (tmp_path / "absent.safetensors", tmp_path):
-        with pytest.raises(FileNotFoundError, match=f"policy: no such file: {path}"):
+        with pytest.raises(FileNotFoundError, match=re.escape(f"policy: no such file: {path}")):
             load_policy(path)
 
 

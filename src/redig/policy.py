@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 from dataclasses import asdict, dataclass
 from pathlib import Path
+from typing import Any
 
 import torch
 from safetensors import SafetensorError, safe_open
@@ -89,7 +90,7 @@ def build_policy(config: PolicyConfig) -> TensorDictSequential:
 
 
 def save_policy(
-    path: str | Path, policy: TensorDictSequential, config: PolicyConfig, environment: dict[str, object] | None = None
+    path: str | Path, policy: TensorDictSequential, config: PolicyConfig, environment: dict[str, Any] | None = None
 ) -> None:
     """Write a policy file; an existing one is replaced only by a complete one.
 
@@ -105,7 +106,7 @@ def save_policy(
         file.write_bytes(save(weights, header))
 
 
-def read_header(path: str | Path) -> tuple[PolicyConfig, dict[str, object]]:
+def read_header(path: str | Path) -> tuple[PolicyConfig, dict[str, Any]]:
     """The architecture of a policy file and the arguments of the scenario that it was trained in.
 
     Raises:
@@ -122,7 +123,9 @@ def read_header(path: str | Path) -> tuple[PolicyConfig, dict[str, object]]:
         raise ValueError(f"policy: {path} is not a safetensors file, or is damaged ({error})") from error
     if header.get("format") != FORMAT:
         raise ValueError(f"policy: {path} has format {header.get('format')!r}, expected {FORMAT!r}")
-    fields = {k: tuple(v) if isinstance(v, list) else v for k, v in json.loads(header["policy"]).items()}
+    fields: dict[str, Any] = {
+        k: tuple(v) if isinstance(v, list) else v for k, v in json.loads(header["policy"]).items()
+    }
     return PolicyConfig(**fields), json.loads(header["environment"])
 
 

@@ -2,7 +2,7 @@ import math
 
 import pytest
 import torch
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 from torch import nn
 
@@ -10,6 +10,7 @@ from redig.modules import DenoisingMLP
 from redig.modules.denoiser import mlp, sinusoidal_embedding
 
 
+@settings(deadline=None)
 @given(st.floats(0, 1000), st.integers(1, 16))
 def test_sinusoidal_embedding_in_closed_form(step, half):
     angles = [step * 10_000 ** (-i / max(half - 1, 1)) for i in range(half)]

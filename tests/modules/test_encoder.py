@@ -2,7 +2,7 @@ import math
 
 import pytest
 import torch
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from redig.modules import GraphEncoder, radius_adjacency
@@ -62,6 +62,7 @@ def plain_loop(encoder, state):
 
 
 @variants
+@settings(deadline=None)
 @given(n=sizes, seed=seeds)
 def test_embeddings_and_message_norms_equal_a_plain_loop(kind, aggregation, n, seed):
     encoder, state = make(kind, aggregation), teams(n, seed)
@@ -73,6 +74,7 @@ def test_embeddings_and_message_norms_equal_a_plain_loop(kind, aggregation, n, s
 
 
 @variants
+@settings(deadline=None)
 @given(n=sizes, seed=seeds)
 def test_dense_equals_sparse(kind, aggregation, n, seed):
     encoder, state = make(kind, aggregation), teams(n, seed)
@@ -91,6 +93,7 @@ def test_dense_equals_sparse_with_one_way_edges(kind, aggregation):
 
 
 @variants
+@settings(deadline=None)
 @given(n=sizes, seed=seeds)
 def test_equivariant_under_permutations(kind, aggregation, n, seed):
     encoder, state = make(kind, aggregation), teams(n, seed)
@@ -100,6 +103,7 @@ def test_equivariant_under_permutations(kind, aggregation, n, seed):
     torch.testing.assert_close(encoder.message_norms(state[:, order]), norms[:, order][:, :, order])
 
 
+@settings(deadline=None)
 @given(n=sizes, seed=seeds)
 def test_linear_kind_is_the_graph_laplacian(n, seed):
     encoder, state = make("linear", activation=None), teams(n, seed, batch=())
@@ -111,6 +115,7 @@ def test_linear_kind_is_the_graph_laplacian(n, seed):
     torch.testing.assert_close(encoder(state), expected)
 
 
+@settings(deadline=None)
 @given(n=sizes, seed=seeds, radius=st.floats(0.1, 5))
 def test_adjacency_equals_a_double_loop(n, seed, radius):
     position = teams(n, seed, batch=())[:, :2]
@@ -127,7 +132,9 @@ def test_adjacency_includes_the_radius_itself():
 
 @pytest.mark.parametrize("n", [5, 40])
 def test_adjacency_does_not_depend_on_where_the_team_is(n):
-    line = torch.stack([torch.arange(n) * 1.0, torch.zeros(n)], -1)  # 2 m reaches the second neighbour, 1.99 m the first
+    line = torch.stack(
+        [torch.arange(n) * 1.0, torch.zeros(n)], -1
+    )  # 2 m reaches the second neighbour, 1.99 m the first
     expected = (torch.arange(n)[:, None] - torch.arange(n)).abs()
     for centre in (0.0, 500.3):
         assert torch.equal(radius_adjacency(line + centre, 1.99), expected == 1)
@@ -179,7 +186,9 @@ def test_position_is_taken_from_the_observation_unless_given(kind, aggregation):
     norms = encoder.message_norms(state, 100 * position)
     assert norms.max() == 0
     nothing = torch.zeros(2, 0, dtype=torch.long)
-    torch.testing.assert_close(encoder.forward_sparse(state[0], nothing, 100 * position[0]), encoder(state, 100 * position)[0])
+    torch.testing.assert_close(
+        encoder.forward_sparse(state[0], nothing, 100 * position[0]), encoder(state, 100 * position)[0]
+    )
 
 
 @variants
@@ -223,6 +232,10 @@ def test_bad_arguments(arguments, message):
 @variants
 def test_wrong_observation_width(kind, aggregation):
     encoder = make(kind, aggregation)
-    for call in (encoder, encoder.message_norms, lambda x: encoder.forward_sparse(x[0], torch.zeros(2, 0, dtype=torch.long))):
+    for call in (
+        encoder,
+        encoder.message_norms,
+        lambda x: encoder.forward_sparse(x[0], torch.zeros(2, 0, dtype=torch.long)),
+    ):
         with pytest.raises(ValueError, match=r"observation: got shape \[.*3, 7\], expected \[\*B, n, 5\]"):
             call(torch.zeros(2, 3, 7, dtype=torch.float64))

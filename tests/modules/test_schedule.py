@@ -2,7 +2,7 @@ import math
 
 import pytest
 import torch
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from redig.modules import NoiseSchedule
@@ -45,7 +45,9 @@ def test_add_noise_equals_one_step_of_noise_after_another(kind):
         mean, variance = math.sqrt(1 - beta) * mean, (1 - beta) * variance + beta
         one, zero, step = torch.ones(1), torch.zeros(1), torch.tensor(k)
         assert schedule.add_noise(one, zero, step).item() == pytest.approx(mean, rel=1e-4, abs=1e-7)
-        assert schedule.add_noise(zero, one, step).item() ** 2 == pytest.approx(variance, rel=1e-4, abs=1e-7)  # the float32 of 1 - alpha
+        assert schedule.add_noise(zero, one, step).item() ** 2 == pytest.approx(
+            variance, rel=1e-4, abs=1e-7
+        )  # the float32 of 1 - alpha
 
 
 def test_add_noise_has_the_moments_of_eq_9():
@@ -76,6 +78,7 @@ def steps(draw, count=2):
     return schedule, sorted(chosen, reverse=True)
 
 
+@settings(deadline=None)
 @given(steps(), st.floats(-1, 1), st.floats(-2, 2))
 def test_posterior_is_the_product_of_two_gaussians(chosen, clean, noisy):
     schedule, (step, previous) = chosen
@@ -110,6 +113,7 @@ def test_posterior_of_neighbours_is_eq_7(kind):
         assert sigma**2 == pytest.approx(betas[k] * (1 - alphas[k - 1]) / (1 - alphas[k]), rel=2e-3)
 
 
+@settings(deadline=None)
 @given(steps(count=3))
 def test_strided_posterior_composes(chosen):
     schedule, (step, middle, previous) = chosen
@@ -119,6 +123,7 @@ def test_strided_posterior_composes(chosen):
     assert schedule.posterior(step, previous) == pytest.approx(composed, rel=1e-6, abs=1e-9)
 
 
+@settings(deadline=None)
 @given(steps())
 def test_posterior_of_the_clean_action_is_the_clean_action(chosen):
     schedule, (step, _) = chosen

@@ -219,7 +219,7 @@ def test_gamma_and_unknown_value_estimator():
     loss, data = constant(), transitions(6)
     loss.make_value_estimator(gamma=0.0)
     torch.testing.assert_close(loss(data)["target_value"], data["next", "reward"].mean())
-    with pytest.raises(ValueError, match="value_type: got ValueEstimators.GAE"):
+    with pytest.raises(ValueError, match=r"value_type: got ValueEstimators\.GAE"):
         loss.make_value_estimator(ValueEstimators.GAE)
 
 
@@ -344,7 +344,9 @@ def test_refined_action_stays_near_the_original():
     data = transitions(50)
     data["action"] *= 0.3
     best, limit = torch.tensor([0.5, -0.5]), 0.05
-    refined = refining(best.tolist(), refine_steps=20, refine_step_size=0.3, refine_max_norm=limit).refine(data, data["action"])
+    refined = refining(best.tolist(), refine_steps=20, refine_step_size=0.3, refine_max_norm=limit).refine(
+        data, data["action"]
+    )
     offset = best - data["action"]  # far enough to be cut, or not: in both cases straight toward the best action
     distance = offset.norm(dim=-1, keepdim=True)
     expected = data["action"] + offset * (limit / distance).clamp_max(1)

@@ -1,6 +1,6 @@
 import pytest
 import torch
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 from tensordict import TensorDict
 
@@ -22,7 +22,9 @@ def trajectories(batch=2, length=6, n=3, seed=0, end=0.2, crash=0.2, flag=torch.
     done = chance(end, batch, length, 1)
     following = {"agents": {"observation": count + 1000, "reward": reward, "info": info}, "done": done}
     agents = {"observation": count, "action": -count, "unused": count}
-    return TensorDict({"agents": agents, "next": following, "collector": {"traj_ids": count[..., 0, 0]}}, [batch, length])
+    return TensorDict(
+        {"agents": agents, "next": following, "collector": {"traj_ids": count[..., 0, 0]}}, [batch, length]
+    )
 
 
 def plain_loop(data, n_steps, gamma):
@@ -30,7 +32,10 @@ def plain_loop(data, n_steps, gamma):
     batch, length = data.shape
     n = data["next", REWARD].shape[2]
     reward, observation = torch.zeros(batch, length, n, 1), torch.zeros(batch, length, n, 1)
-    terminated, steps = torch.zeros(batch, length, n, 1, dtype=torch.bool), torch.zeros(batch, length, n, 1, dtype=torch.long)
+    terminated, steps = (
+        torch.zeros(batch, length, n, 1, dtype=torch.bool),
+        torch.zeros(batch, length, n, 1, dtype=torch.long),
+    )
     for b in range(batch):
         for t in range(length):
             end = t
@@ -48,6 +53,7 @@ def plain_loop(data, n_steps, gamma):
     return reward, terminated, observation, steps
 
 
+@settings(deadline=None)
 @given(
     n_steps=st.integers(1, 9),
     gamma=st.floats(0, 1),
@@ -71,6 +77,7 @@ def test_equals_a_plain_loop(n_steps, gamma, length, n, seed, end, crash, flag):
     assert (data == before).all()
 
 
+@settings(deadline=None)
 @given(seed=st.integers(0, 2**31), gamma=st.floats(0, 1))
 def test_window_of_one_step_is_the_transition_itself(seed, gamma):
     data = trajectories(seed=seed)
@@ -130,7 +137,9 @@ def test_other_keys_and_batch_shapes():
         },
         data.shape,
     )
-    renamed = MultiStep(3, 0.9, ["state"], ["state"], reward="r", robot_terminated="crashed", terminated="end", done="over")
+    renamed = MultiStep(
+        3, 0.9, ["state"], ["state"], reward="r", robot_terminated="crashed", terminated="end", done="over"
+    )
     expected = MultiStep(3, 0.9)(data)
     for shape in [(2, 6), (1, 2, 6)]:
         out = renamed(plain.reshape(shape)).reshape(2, 6)

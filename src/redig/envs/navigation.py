@@ -67,7 +67,7 @@ class FormationNavigation(BaseScenario):
         offsets = formation_offsets(self.formation, self.n_robots, self.formation_width)
         self.offsets = offsets.to(device)
         self.desired = pairwise_distances(self.offsets)
-        self.obstacle_map = self.obstacle_map.to(device)
+        self.obstacle_map: ObstacleMap = self.obstacle_map.to(device)
         angle = torch.tensor(self.corridor_angle, device=device)
         self.axis = torch.stack([angle.cos(), angle.sin()])
         world = World(batch_dim, device, dt=self.dt, drag=0.0)
@@ -135,7 +135,7 @@ class FormationNavigation(BaseScenario):
                 f"it must be greater than {2 * self.radius} m"
             )
         obstacle_map: ObstacleMap | None = take("obstacle_map", None)
-        self.obstacle_map = obstacle_map or corridor(corridor_width, corridor_length, self.corridor_angle)
+        self.obstacle_map: ObstacleMap = obstacle_map or corridor(corridor_width, corridor_length, self.corridor_angle)
         if kwargs:
             raise TypeError(f"unknown argument(s) of FormationNavigation: {', '.join(sorted(kwargs))}")
 
@@ -257,7 +257,7 @@ class FormationNavigation(BaseScenario):
         mate = zero if mate is None else mate.to(zero.dtype)
         self.quantities = {
             "observation": torch.cat(observation, -1),
-            "reward": sum(parts.values()),
+            "reward": torch.stack(list(parts.values())).sum(0),
             "position": position,
             "velocity": velocity,
             "pairwise_distance": pairwise_distances(position),

@@ -165,7 +165,7 @@ class DIPOLoss(LossModule):
             raise ValueError("detach_encoder: a separate critic_encoder leaves no shared encoder to detach")
         if loss_function not in ("l2", "smooth_l1"):
             raise ValueError(f"loss_function: got {loss_function!r}, allowed are l2, smooth_l1")
-        self._in_keys = None
+        self._in_keys: list[NestedKey] | None = None
         super().__init__()
         self.has_encoder, self.separate_encoders = encoder is not None, critic_encoder is not None
         if encoder is not None:

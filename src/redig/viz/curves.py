@@ -23,24 +23,28 @@ PANELS = (
 )
 
 
-def plot_learning_curves(path: str | os.PathLike, rows: Sequence[Row]) -> None:
+def plot_learning_curves(path: str | os.PathLike, *runs: Sequence[Row]) -> None:
     """Draw success, travel time, CFI and jerk over the updates; dashed lines mark the cloned policy.
+
+    Several runs are drawn as thin lines with their mean on top; they must have been evaluated after the same updates.
 
     Args:
         path: of the figure, PNG, PDF or SVG by its suffix; an existing file is replaced at once.
-        rows: one an evaluation, with the keys of :func:`redig.evaluation.evaluate` and ``updates``. The first row is
-            the cloned policy. Missing values (``None`` or NaN) leave gaps.
+        runs: the evaluations of each run, in order, with the keys of
+            :func:`redig.evaluation.evaluate` and ``updates``. The first row is the cloned policy. Missing values (``None`` or NaN) leave gaps.
 
     Raises:
-        ValueError: if there are no rows, or the suffix is not one of those allowed.
+        ValueError: if a run has no rows, runs differ in their updates, or the suffix is not one of those allowed.
         KeyError: if a row lacks a key.
     """
     path = check_suffix(path, IMAGE_SUFFIXES)
-    if not rows:
-        raise ValueError("rows: got none, expected at least one evaluation")
+    if not runs or not all(runs):
+        raise ValueError("runs: got none, or one without rows; expected at least one evaluation of each")
+    if any(_column(rows, "updates") != _column(runs[0], "updates") for rows in runs):
+        raise ValueError("runs: they were evaluated after different numbers of updates")
     figure = Figure(figsize=(7.0, 4.2), layout="constrained")
     for axes, (title, series, limits) in zip(figure.subplots(2, 2, sharex=True).flat, PANELS, strict=True):
-        _panel(axes, rows, series)
+        _panel(axes, runs, series)
         axes.set_title(title, size=9, loc="left")
         if limits is not None:
             axes.set_ylim(limits)
@@ -52,11 +56,15 @@ def plot_learning_curves(path: str | os.PathLike, rows: Sequence[Row]) -> None:
         figure.savefig(unfinished, dpi=200)
 
 
-def _panel(axes: Axes, rows: Sequence[Row], series: Mapping[str, str]) -> None:
+def _panel(axes: Axes, runs: Sequence[Sequence[Row]], series: Mapping[str, str]) -> None:
     """One panel: a line and its dashed reference for every key in ``series``, which maps keys to labels."""
-    updates = _column(rows, "updates")
+    updates = _column(runs[0], "updates")
     for (key, label), colour, marker in zip(series.items(), PALETTE, "os", strict=False):
-        values = _column(rows, key)
+        columns = [_column(rows, key) for rows in runs]
+        values = [sum(at) / len(at) for at in zip(*columns, strict=True)]
+        if len(columns) > 1:
+            for column in columns:
+                axes.plot(updates, column, color=colour, linewidth=0.7, alpha=0.5)
         axes.plot(updates, values, color=colour, marker=marker, markersize=3, linewidth=1.3, label=label)
         axes.axhline(values[0], color=colour, linestyle=DASHES, linewidth=0.9)
     if len(series) > 1:
