@@ -61,7 +61,7 @@ def spread(values: list[float | None]) -> str:
     """Mean ± standard deviation of what was measured."""
     found = [value for value in values if value is not None]
     if not found:
-        return "–"
+        return "-"
     return f"{statistics.fmean(found):.3f} ± {statistics.stdev(found) if len(found) > 1 else 0.0:.3f}"
 
 

@@ -25,6 +25,9 @@ from redig.checkpoint import (
 )
 from redig.envs import make_env
 
+# torch warns of what these tests write on purpose
+pytestmark = pytest.mark.filterwarnings("ignore:Detected pickle protocol")
+
 STATE = {"weights": {"a": torch.arange(50.0)}, "step": 7, "best": 0.5, "name": "run", "history": [1, {"x": 2.0}]}
 
 

@@ -83,11 +83,13 @@ def test_the_reward_is_the_sum_of_its_parts(formation_reward, navigation_reward)
 
 
 def test_reward_weights_and_variants_against_positions_and_velocities():
-    def rollout(**kwargs):
-        return info_of(run(short_trip(2, arrival_bonus=3.0, **kwargs), 12))
+    def rollout(pace=1.0, **kwargs):
+        return info_of(run(short_trip(2, arrival_bonus=3.0, **kwargs), 12, lambda state: pace * towards_goal(state)))
+
+    paces = torch.tensor([1.0, 0.2, 0.5, 0.7, 0.9]).unsqueeze(-1)  # so that shape and speeds differ
 
     desired = pairwise_distances(formation_offsets("wedge", 5))
-    info = rollout(formation_weight=0.25, omega=0.7)
+    info = rollout(paces, formation_weight=0.25, omega=0.7)
     position, velocity = info["position"], info["velocity"]
     spring, damper = (desired - pairwise_distances(position)).abs(), pairwise_distances(velocity)
     team = -0.25 * (0.7 * spring + 0.3 * damper).sum((-2, -1))
@@ -98,7 +100,7 @@ def test_reward_weights_and_variants_against_positions_and_velocities():
     expected = (velocity * away / away.norm(dim=-1, keepdim=True)).sum(-1) * velocity.norm(dim=-1)
     torch.testing.assert_close(info["navigation_reward"], expected * moving, atol=1e-4, rtol=0)
 
-    info = rollout(formation_reward="spring_damper_bonus", formation_weight=0.25, omega=0.7)
+    info = rollout(paces, formation_reward="spring_damper_bonus", formation_weight=0.25, omega=0.7)
     pairs = 1 - (desired - pairwise_distances(info["position"])).abs().clamp_max(1)
     pairs = pairs - 0.3 / 0.7 * pairwise_distances(info["velocity"])
     expected = 0.25 * (pairs.sum(-1) - 1) / 4  # less the pair of a robot with itself

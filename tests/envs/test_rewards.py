@@ -67,9 +67,11 @@ def test_best_lateral_scale_beats_every_scale_of_a_grid(seed, name, n, squeeze):
     relative = position - position.mean(0)
     places = torch.stack([offsets[:, 0].expand(8001, n), grid[:, None] * offsets[:, 1]], -1)
     error = (relative - places).norm(dim=-1)
-    best = error.square().sum(-1).argmin()
+    best = error.square().sum(-1).argmin()  # a clamped scale is the best one within the limits
     assert scale.item() == pytest.approx(grid[best].item(), abs=1e-4)
-    torch.testing.assert_close(residual, error[best], atol=1e-3, rtol=0)
+    for i in range(n):  # with the team stretched back to full width
+        ahead, aside = relative[i, 0] - offsets[i, 0], relative[i, 1] / grid[best] - offsets[i, 1]
+        assert residual[i].item() == pytest.approx(math.hypot(ahead, aside), abs=2e-3)
 
 
 @given(seeds, st.floats(-math.pi, math.pi))
@@ -96,16 +98,24 @@ def test_a_squeezed_formation_only_pays_the_price_of_squeezing(squeeze, expected
     offsets = formation_offsets("wedge", 5)
     position = offsets * torch.tensor([1.0, squeeze]) + 2.0
     found = rewards.scaled_formation_bonus(position, offsets, torch.tensor([1.0, 0.0]))
-    assert found.item() == pytest.approx(expected, abs=1e-5)
+    torch.testing.assert_close(found, torch.full((5,), expected), atol=1e-4, rtol=0)
 
 
-def test_scaled_bonus_is_lost_with_the_mean_residual():
-    offsets = torch.tensor([[0.0, -1.0], [0.0, 1.0]])
-    position = torch.tensor([[-0.1, -1.0], [0.1, 1.0]])  # both 0.1 m from their places
-    found = rewards.scaled_formation_bonus(position, offsets, torch.tensor([1.0, 0.0]), tolerance=0.5)
-    assert found.item() == pytest.approx(1 - 0.1 / 0.5, abs=1e-5)
-    far = rewards.scaled_formation_bonus(10 * position, offsets, torch.tensor([1.0, 0.0]), tolerance=0.5)
-    assert far.item() == pytest.approx(0, abs=1e-5)
+@pytest.mark.parametrize("squeeze", [1.0, 0.5])
+def test_each_robot_loses_the_scaled_bonus_with_its_own_residual(squeeze):
+    offsets = torch.tensor([[0.0, -1.0], [0.0, 0.0], [0.0, 1.0]])
+    position = torch.tensor([[0.3, -squeeze], [-0.2, 0.0], [-0.1, squeeze]])  # residuals of 0.3, 0.2 and 0.1 m
+    found = rewards.scaled_formation_bonus(position, offsets, torch.tensor([1.0, 0.0]), tolerance=0.25)
+    expected = torch.tensor([0.0, 0.2, 0.6]) - 0.5 * (1 - squeeze)  # no bonus from 0.25 m on
+    torch.testing.assert_close(found, expected, atol=1e-5, rtol=0)
+
+
+def test_an_error_across_counts_against_the_squeezed_width():
+    offsets = torch.tensor([[0.0, -1.0], [0.0, 0.0], [0.0, 1.0]])
+    position = torch.tensor([[0.0, -0.45], [0.0, -0.10], [0.0, 0.55]])  # the middle robot 0.1 m off, at half the width
+    scale, residual = rewards.best_lateral_scale(position, offsets, torch.tensor([1.0, 0.0]))
+    torch.testing.assert_close(scale, torch.tensor(0.5))
+    torch.testing.assert_close(residual, torch.tensor([0.1, 0.2, 0.1]))
 
 
 @given(seeds, st.floats(0, 2), st.floats(-math.pi, math.pi), st.floats(0.1, 5))

@@ -61,13 +61,15 @@ class FormationNavigation(BaseScenario):
         torch.Size([4, 3, 9])
     """
 
+    obstacle_map: ObstacleMap
+
     def make_world(self, batch_dim: int, device: torch.device, **kwargs) -> World:
         """Build the team and its map (called by VMAS)."""
         self._read_arguments(kwargs)
         offsets = formation_offsets(self.formation, self.n_robots, self.formation_width)
         self.offsets = offsets.to(device)
         self.desired = pairwise_distances(self.offsets)
-        self.obstacle_map: ObstacleMap = self.obstacle_map.to(device)
+        self.obstacle_map = self.obstacle_map.to(device)
         angle = torch.tensor(self.corridor_angle, device=device)
         self.axis = torch.stack([angle.cos(), angle.sin()])
         world = World(batch_dim, device, dt=self.dt, drag=0.0)
@@ -135,7 +137,7 @@ class FormationNavigation(BaseScenario):
                 f"it must be greater than {2 * self.radius} m"
             )
         obstacle_map: ObstacleMap | None = take("obstacle_map", None)
-        self.obstacle_map: ObstacleMap = obstacle_map or corridor(corridor_width, corridor_length, self.corridor_angle)
+        self.obstacle_map = obstacle_map or corridor(corridor_width, corridor_length, self.corridor_angle)
         if kwargs:
             raise TypeError(f"unknown argument(s) of FormationNavigation: {', '.join(sorted(kwargs))}")
 

@@ -30,8 +30,8 @@ def plot_learning_curves(path: str | os.PathLike, *runs: Sequence[Row]) -> None:
 
     Args:
         path: of the figure, PNG, PDF or SVG by its suffix; an existing file is replaced at once.
-        runs: the evaluations of each run, in order, with the keys of
-            :func:`redig.evaluation.evaluate` and ``updates``. The first row is the cloned policy. Missing values (``None`` or NaN) leave gaps.
+        runs: the evaluations of each run, in order, with the keys of :func:`redig.evaluation.evaluate` and
+            ``updates``. The first row is the cloned policy. Missing values (``None`` or NaN) leave gaps.
 
     Raises:
         ValueError: if a run has no rows, runs differ in their updates, or the suffix is not one of those allowed.
