@@ -4,9 +4,10 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import tyro
+from tensordict.nn import TensorDictModuleBase
 
 from redig.envs.factory import make_env
 from redig.evaluation import evaluate, format_table, rollout_trajectories, write_metrics
@@ -50,15 +51,19 @@ def main(arguments: Arguments) -> dict[str, float]:
     arguments.out.mkdir(parents=True, exist_ok=True)
     write_metrics(arguments.out / "metrics.json", metrics)
     if arguments.animation:
-        one = make_env(1, **scenario)
-        rollout = rollout_trajectories(policy, one, seed=arguments.seed)
-        position = rollout["position"][0, rollout["mask"][0]]
-        world = one.base_env.scenario
-        picture = {"formation": world.formation, "obstacle_map": world.obstacle_map, "goal": world.goal[0]}
-        plot_trajectories(arguments.out / "trajectories.png", position, **picture)
-        animate(arguments.out / "trajectories.gif", position, **picture)
+        draw_crossing(arguments.out, policy, scenario, arguments.seed)
     print(f"written to {arguments.out}")
     return metrics
+
+
+def draw_crossing(folder: Path, policy: TensorDictModuleBase, scenario: dict[str, Any], seed: int) -> None:
+    """One crossing as a figure and as an animation."""
+    env = make_env(1, **scenario)
+    rollout = rollout_trajectories(policy, env, seed)
+    position = rollout["position"][0, rollout["mask"][0]]
+    world = env.base_env.scenario
+    plot_trajectories(folder / "trajectories.png", position, world.formation, world.obstacle_map, world.goal[0])
+    animate(folder / "trajectories.gif", position, world.formation, world.obstacle_map, world.goal[0])
 
 
 if __name__ == "__main__":

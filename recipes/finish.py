@@ -6,12 +6,13 @@ import platform
 
 import torch
 from config import Config
+from evaluate import draw_crossing
 from run import Run
 
 from redig.envs.factory import make_env
-from redig.evaluation import evaluate, format_table, rollout_trajectories, write_metrics
+from redig.evaluation import evaluate, format_table, write_metrics
 from redig.policy import load_policy
-from redig.viz import animate, plot_learning_curves, plot_trajectories
+from redig.viz import plot_learning_curves
 
 TEST_SEED = 2_000_000  # starts of the final evaluation, the same for every training seed
 
@@ -34,18 +35,7 @@ def finish(run: Run, config: Config) -> dict[str, float]:
     metrics = results["policy"]
     others = {f"{name}_{key}": value for name in ("cloned", "last") for key, value in results[name].items()}
     write_metrics(run.folder / "metrics.json", {**metrics, **others})
-    draw(run, config)
+    plot_learning_curves(run.folder / "learning_curve.png", run.evaluations)
+    draw_crossing(run.folder, load_policy(run.folder / "policy.safetensors"), config.scenario(), TEST_SEED)
     print(f"\neverything is in {run.folder} ({platform.machine()}, {torch.get_num_threads()} threads)")
     return metrics
-
-
-def draw(run: Run, config: Config) -> None:
-    """The learning curve of a run, and one crossing of its policy as a figure and as an animation."""
-    plot_learning_curves(run.folder / "learning_curve.png", run.evaluations)
-    env = make_env(1, **config.scenario())
-    rollout = rollout_trajectories(load_policy(run.folder / "policy.safetensors"), env, seed=TEST_SEED)
-    position = rollout["position"][0, rollout["mask"][0]]
-    scenario = env.base_env.scenario
-    picture = {"formation": config.formation, "obstacle_map": scenario.obstacle_map, "goal": scenario.goal[0]}
-    plot_trajectories(run.folder / "trajectories.png", position, **picture)
-    animate(run.folder / "trajectories.gif", position, **picture)

@@ -75,6 +75,7 @@ def train(config: Config) -> dict[str, float]:
         total_frames=-1,
         postproc=multi_step,
         exploration_type=ExplorationType.RANDOM,
+        auto_register_policy_transforms=False,
     )
     experience = iter(collector)
 

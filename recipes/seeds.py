@@ -1,4 +1,4 @@
-"""Summarise runs that differ in their seed: ``python recipes/seeds.py runs/wedge-seed{0,1,2} --out docs/results/wedge``."""
+"""Summarise runs that differ in their seed: ``python recipes/seeds.py runs/wedge-seed{0,1,2} --out summary``."""
 
 from __future__ import annotations
 

@@ -2,5 +2,6 @@
 
 from redig.objectives.dipo import DIPOLoss
 from redig.objectives.multi_step import MultiStep
+from redig.objectives.refinement import refine_actions
 
-__all__ = ["DIPOLoss", "MultiStep"]
+__all__ = ["DIPOLoss", "MultiStep", "refine_actions"]

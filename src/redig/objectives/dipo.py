@@ -12,8 +12,10 @@ from tensordict.utils import NestedKey
 from torch import Tensor
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 from torchrl.objectives import LossModule, ValueEstimators
-from torchrl.objectives.utils import _vmap_func, default_value_kwargs
+from torchrl.objectives.utils import _vmap_func, default_value_kwargs, distance_loss
 from torchrl.objectives.value import TD0Estimator, TD1Estimator, TDLambdaEstimator
+
+from redig.objectives.refinement import refine_actions
 
 _ESTIMATORS = {
     ValueEstimators.TD0: TD0Estimator,
@@ -193,9 +195,7 @@ class DIPOLoss(LossModule):
         """Keys that a batch must have."""
         if self._in_keys is None:
             keys, first = self.tensor_keys, self.encoder_network if self.has_encoder else self.actor_network
-            states = list(
-                dict.fromkeys([*first.in_keys, *(k for k in self.qvalue_network.in_keys if self._is_state(k))])
-            )
+            states = list(dict.fromkeys([*first.in_keys, *filter(self._is_state, self.qvalue_network.in_keys)]))
             self._in_keys = [keys.action, *states, *(_under_next(k) for k in states)]
             self._in_keys += [_under_next(k) for k in (keys.reward, keys.done, keys.terminated)]
         return self._in_keys
@@ -235,12 +235,8 @@ class DIPOLoss(LossModule):
         if self.detach_encoder:
             embedding = embedding.detach()
         value = self._qvalues(embedding, tensordict[keys.action], self.qvalue_network_params)
-        error = (value - target).abs()
-        if self.loss_function == "l2":
-            loss = error.square()
-        else:
-            loss = torch.nn.functional.smooth_l1_loss(value, target.expand_as(value), reduction="none")
-        tensordict[keys.priority] = error.detach().mean(0)
+        loss = distance_loss(value, target.expand_as(value), self.loss_function)
+        tensordict[keys.priority] = (value - target).detach().abs().mean(0)
         weights = self._maybe_get_priority_weight(tensordict)
         loss = self._reduce(loss.sum(0), tensordict, weights)
         return loss, {
@@ -282,27 +278,20 @@ class DIPOLoss(LossModule):
         Returns:
             refined action ``[*B, n, A]`` within the bounds of the actor, detached.
         """
-        action = action.detach()
         if self.refine_steps == 0:
-            return action
+            return action.detach()
         with torch.no_grad():
             embedding = self._critic_embedding(tensordict)
         params = self.qvalue_network_params.detach()
-
-        def value(candidate: Tensor) -> Tensor:
-            return self._qvalues(embedding, candidate, params).amin(0).sum()
-
-        gradient = torch.func.grad(value)
-        low, high = self.actor_network.module.low, self.actor_network.module.high
-        refined = action
-        for _ in range(self.refine_steps):
-            refined = refined + self.refine_step_size * gradient(refined)
-            if self.refine_max_norm is not None:
-                shift = refined - action
-                norm = shift.norm(dim=-1, keepdim=True)
-                refined = action + shift * (self.refine_max_norm / norm.clamp_min(self.refine_max_norm))
-            refined = refined.maximum(low).minimum(high)
-        return refined.detach()
+        return refine_actions(
+            action,
+            lambda candidate: self._qvalues(embedding, candidate, params).amin(0),
+            self.actor_network.module.low,
+            self.actor_network.module.high,
+            self.refine_steps,
+            self.refine_step_size,
+            self.refine_max_norm,
+        )
 
     def _embed(self, tensordict: TensorDictBase, name: str, target: bool = False) -> TensorDictBase:
         """What a network reads: the encoder's output, or the observations where there is no encoder."""
