@@ -46,8 +46,6 @@ def train(config: Config) -> dict[str, float]:
     scenario = config.scenario()
     env = make_env(config.num_envs, seed=config.seed, reward_scale=config.reward_scale, **scenario)
     validation_env = make_env(config.evaluation_starts, **scenario)
-    folder = config.resume or config.out or Path("runs") / f"{config.formation}-seed{config.seed}"
-    run = Run(folder, config, config.logger, resume=config.resume is not None)
 
     # Line 1: initialise phi, psi, Q1 and Q2
     policy_config = policy_architecture(config, env.observation_spec[OBSERVATION].shape[-1])
@@ -56,6 +54,8 @@ def train(config: Config) -> dict[str, float]:
     policy = averaged_policy(loss, policy_config) if config.act_with_target else learner
     target = SoftUpdate(loss, tau=config.tau)
     actor_optimizer, critic_optimizer = make_optimizers(config, loss)
+    folder = config.resume or config.out or Path("runs") / f"{config.formation}-seed{config.seed}"
+    run = Run(folder, config, config.logger, resume=config.resume is not None)
 
     # Line 2: individual planners fill the buffer with uncoordinated trajectories
     multi_step = MultiStep(config.n_steps, config.gamma, keep=[OBSERVATION, ACTION, BASE_ACTION, ARRIVED])
