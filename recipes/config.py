@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any
 
 # too much of it, and a team keeps its shape rather than arrive
-FORMATION_WEIGHT = {"wedge": 3.25, "line": 1.0, "circle": 2.0}
+FORMATION_WEIGHT = {"wedge": 2.5, "line": 1.0, "circle": 2.0}
 SMOKE: dict[str, Any] = {  # the whole program in under a minute; it learns nothing
     "num_trajectories": 100, "clone_updates": 20, "critic_updates": 10, "warmup_steps": 20, "env_steps": 40,
     "evaluation_interval": 20, "evaluation_starts": 8, "num_starts": 8, "num_envs": 8, "hidden": 32,

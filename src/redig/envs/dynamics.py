@@ -45,10 +45,41 @@ def limit_norm(vector: Tensor, limit: float) -> Tensor:
     return vector * (limit / vector.norm(dim=-1, keepdim=True).clamp_min(limit))
 
 
-def separate(
+def part_robots(position: Tensor, velocity: Tensor, radius: float) -> tuple[Tensor, Tensor]:
+    """Push overlapping robots apart by half the overlap each, and take their closing speed (inelastic contact).
+
+    One pass: two robots end apart, in a crowd some overlap may be left for the next step. Robots that cover no more
+    than their radius in a step cannot pass through each other.
+
+    Args:
+        position: ``[*B, n, 2]`` (m).
+        velocity: ``[*B, n, 2]`` (m/s).
+        radius: of a robot (m).
+
+    Returns:
+        position and velocity after the contact, shapes as given.
+
+    Examples:
+        >>> import torch
+        >>> part_robots(torch.tensor([[0.0, 0.0], [0.1, 0.0]]), torch.tensor([[1.0, 0.0], [-1.0, 0.5]]), radius=0.1)
+        (tensor([[-0.0500,  0.0000],
+                [ 0.1500,  0.0000]]), tensor([[0.0000, 0.0000],
+                [0.0000, 0.5000]]))
+    """
+    relative = position.unsqueeze(-2) - position.unsqueeze(-3)  # [*B, n, n, 2], from j to i
+    gap = relative.norm(dim=-1, keepdim=True)
+    apart = relative / gap.clamp_min(1e-6)
+    myself = torch.eye(position.shape[-2], dtype=torch.bool, device=position.device).unsqueeze(-1)
+    push = apart * (2 * radius - gap).clamp_min(0).masked_fill(myself, 0) / 2
+    touching = (gap < 2 * radius + 1e-4) & ~myself
+    closing = ((velocity.unsqueeze(-2) - velocity.unsqueeze(-3)) * apart).sum(-1, keepdim=True).clamp_max(0)
+    return position + push.sum(-2), velocity - (apart * closing / 2 * touching).sum(-2)
+
+
+def leave_walls(
     position: Tensor, velocity: Tensor, radius: float, distance: Tensor, direction: Tensor
 ) -> tuple[Tensor, Tensor]:
-    """Push robots out of walls and out of each other, and stop their motion into a wall (rigid, inelastic contact).
+    """Push robots out of walls, and take their motion into them (inelastic contact, no friction).
 
     Args:
         position: ``[*B, n, 2]`` (m).
@@ -60,12 +91,6 @@ def separate(
     Returns:
         position and velocity after the contact, shapes as given.
     """
-    n = position.shape[-2]
-    relative = position.unsqueeze(-2) - position.unsqueeze(-3)  # [*B, n, n, 2], from j to i
-    gap = relative.norm(dim=-1, keepdim=True)
-    myself = torch.eye(n, dtype=torch.bool, device=position.device).unsqueeze(-1)
-    overlap = (2 * radius - gap).clamp_min(0).masked_fill(myself, 0)
-    push = (relative / gap.clamp_min(1e-6) * overlap / 2).sum(-2)
-    into_wall = (radius - distance).clamp_min(0).unsqueeze(-1)
-    inward = (velocity * direction).sum(-1, keepdim=True).clamp_min(0) * (into_wall > 0)
-    return position + push - direction * into_wall, velocity - direction * inward
+    inside = (radius - distance).clamp_min(0).unsqueeze(-1)
+    inward = (velocity * direction).sum(-1, keepdim=True).clamp_min(0) * (inside > 0)
+    return position - direction * inside, velocity - direction * inward

@@ -21,7 +21,8 @@ def formation_offsets(name: str, n: int, width: float = 2.0) -> Tensor:
     Args:
         name: one of ``"wedge"``, ``"line"`` (abreast) and ``"circle"``.
         n: number of robots, at least 2 (3 for a wedge or a circle).
-        width: extent across the direction of travel (m); for the circle, its diameter.
+        width: extent across the direction of travel (m); for the circle, its diameter. A wedge of an even number lacks
+            the last robot on the right.
 
     Returns:
         offsets ``[n, 2]`` (m): forward, left.

@@ -29,8 +29,8 @@ class ObstacleMap:
         >>> import torch
         >>> trunk = ObstacleMap(torch.tensor([[0.0, 0.0, 0.0, 0.0, 0.0, 0.5]]), gap=1.0, bounds=(-2, -2, 2, 2))
         >>> distance, direction = trunk.nearest(torch.tensor([2.0, 0.0]))
-        >>> distance.item(), direction.tolist()
-        (1.5, [-1.0, 0.0])
+        >>> round(distance.item(), 4), direction[0].item()
+        (1.5, -1.0)
     """
 
     obstacles: Tensor
@@ -53,7 +53,7 @@ class ObstacleMap:
 
         Returns:
             distance ``[*B]`` (m), negative inside an obstacle, and direction ``[*B, 2]``. Inside an obstacle the
-            direction points away from the nearest way out, so ``-direction`` always leads to free space.
+            direction points away from the nearest way out of that obstacle.
         """
         centre, half, heading, radius = self.obstacles.split([2, 2, 1, 1], -1)
         cos, sin = heading.cos().squeeze(-1), heading.sin().squeeze(-1)
@@ -94,8 +94,8 @@ def corridor(width: float = 1.1, length: float = 2.0, angle: float = 0.0, wall: 
 
     Examples:
         >>> import torch
-        >>> corridor(width=1.1).signed_distance(torch.zeros(2)).item()
-        0.550000011920929
+        >>> round(corridor(width=1.1).signed_distance(torch.zeros(2)).item(), 4)
+        0.55
     """
     for name, value in (("corridor_width", width), ("corridor_length", length), ("wall", wall)):
         if not value > 0:

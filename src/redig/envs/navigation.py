@@ -8,7 +8,7 @@ from vmas.simulator.core import Agent, Sphere, World
 from vmas.simulator.scenario import BaseScenario
 
 from redig.envs import rewards
-from redig.envs.dynamics import VelocityCommand, separate
+from redig.envs.dynamics import VelocityCommand, leave_walls, part_robots
 from redig.envs.formations import formation_offsets, pairwise_distances
 from redig.envs.maps import ObstacleMap, corridor
 
@@ -128,6 +128,11 @@ class FormationNavigation(BaseScenario):
         for name in positive:
             if not getattr(self, name) > 0:
                 raise ValueError(f"{name}: got {getattr(self, name)}, must be greater than 0")
+        if self.max_speed * self.dt > self.radius:
+            raise ValueError(
+                f"max_speed: got {self.max_speed} m/s, at which a robot covers more than its radius ({self.radius} m) "
+                f"in a step of {self.dt} s and could pass through another; lower it, or lower dt"
+            )
         for name, allowed in (("formation_reward", FORMATION_REWARDS), ("navigation_reward", NAVIGATION_REWARDS)):
             if getattr(self, name) not in allowed:
                 raise ValueError(f"{name}: got {getattr(self, name)!r}, allowed are {', '.join(allowed)}")
@@ -198,11 +203,12 @@ class FormationNavigation(BaseScenario):
     def post_step(self) -> None:
         """Resolve contacts, then measure the step."""
         position, velocity = self._positions(), self._velocities()
-        obstacle_distance, direction = self.obstacle_map.nearest(position)
+        obstacle_distance = self.obstacle_map.signed_distance(position)
         wall = obstacle_distance < self.radius
         free = rewards.clearance(position, obstacle_distance, self.radius)
         mate = rewards.clearance(position, torch.full_like(obstacle_distance, 1e9), self.radius) < 0
-        position, velocity = separate(position, velocity, self.radius, obstacle_distance, direction)
+        position, velocity = part_robots(position, velocity, self.radius)
+        position, velocity = leave_walls(position, velocity, self.radius, *self.obstacle_map.nearest(position))
         for i, agent in enumerate(self.world.agents):
             agent.state.pos, agent.state.vel = position[:, i], velocity[:, i]
         collision = wall | mate

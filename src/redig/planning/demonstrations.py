@@ -24,7 +24,7 @@ from redig.planning.rrt import rrt
 from redig.planning.tracking import PathTracker, pad_paths
 
 PLANNERS = ("astar", "rrt")
-VERSION = 2  # part of the cache's hash: raise it whenever this package would make different demonstrations
+VERSION = 3  # part of the cache's hash: raise it whenever this package would make different demonstrations
 KEYS = (
     ("agents", "observation"),
     ("agents", "action"),
