@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import pickle
+import zipfile
 from pathlib import Path
 from typing import Any
 
@@ -37,13 +38,16 @@ def load_checkpoint(path: str | Path) -> dict[str, Any]:
     path = Path(path)
     if not path.is_file():
         raise FileNotFoundError(f"checkpoint: no such file: {path}")
+    remedy = "start a new run, or restore the file from a copy"
     try:
-        return torch.load(path, weights_only=True)
-    except (RuntimeError, EOFError, OSError, pickle.UnpicklingError) as error:
-        raise ValueError(
-            f"checkpoint: {path} is damaged or not a checkpoint ({str(error).splitlines()[0]}); "
-            "start a new run, or restore the file from a copy"
-        ) from error
+        with zipfile.ZipFile(path) as archive:
+            broken = archive.testzip()  # torch.load itself does not look at the check sums
+        if broken is None:
+            return torch.load(path, weights_only=True)
+    except (zipfile.BadZipFile, EOFError, OSError, RuntimeError, pickle.UnpicklingError) as error:
+        reason = f"{type(error).__name__}: {str(error).partition(chr(10))[0]}"
+        raise ValueError(f"checkpoint: {path} is damaged or not a checkpoint ({reason}); {remedy}") from error
+    raise ValueError(f"checkpoint: {path} is damaged (check sum of {broken}); {remedy}")
 
 
 def rng_state() -> dict[str, torch.Tensor]:
@@ -65,13 +69,18 @@ def collection_state(env: EnvBase, collector: Collector) -> dict[str, Any]:
         collector: the collector that steps it.
     """
     carrier = collector._carrier.select(*env.state_keys, *env.observation_keys, *env.done_keys, "collector")
-    return {"scenario": env.base_env.scenario.state_dict(), "carrier": flat(carrier)}
+    return {
+        "scenario": env.base_env.scenario.state_dict(),
+        "carrier": flat(carrier),
+        "traj_pool": collector._traj_pool.state_dict(),
+    }
 
 
 def set_collection_state(env: EnvBase, collector: Collector, state: dict[str, Any]) -> None:
     """Restore what :func:`collection_state` returned."""
     env.base_env.scenario.load_state_dict(state["scenario"])
     collector._carrier.update(unflat(state["carrier"], collector._carrier.batch_size))
+    collector._traj_pool.load_state_dict(state["traj_pool"])
 
 
 def buffer_state(buffer: ReplayBuffer) -> dict[str, Any]:

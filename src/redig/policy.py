@@ -9,7 +9,7 @@ from typing import Any
 
 import torch
 from safetensors import SafetensorError, safe_open
-from safetensors.torch import save
+from safetensors.torch import load_file, save
 from tensordict.nn import TensorDictModule, TensorDictSequential
 from torchrl.data import Bounded
 
@@ -123,10 +123,11 @@ def read_header(path: str | Path) -> tuple[PolicyConfig, dict[str, Any]]:
         raise ValueError(f"policy: {path} is not a safetensors file, or is damaged ({error})") from error
     if header.get("format") != FORMAT:
         raise ValueError(f"policy: {path} has format {header.get('format')!r}, expected {FORMAT!r}")
-    fields: dict[str, Any] = {
-        k: tuple(v) if isinstance(v, list) else v for k, v in json.loads(header["policy"]).items()
-    }
-    return PolicyConfig(**fields), json.loads(header["environment"])
+    try:
+        policy, environment = json.loads(header["policy"]), json.loads(header["environment"])
+        return PolicyConfig(**{k: tuple(v) if isinstance(v, list) else v for k, v in policy.items()}), environment
+    except (KeyError, TypeError, ValueError) as error:
+        raise ValueError(f"policy: the header of {path} is damaged, or of another version ({error})") from error
 
 
 def load_policy(path: str | Path, observation_dim: int | None = None) -> TensorDictSequential:
@@ -147,6 +148,8 @@ def load_policy(path: str | Path, observation_dim: int | None = None) -> TensorD
             f"gives {observation_dim}; build the environment with the same observe_direction"
         )
     policy = build_policy(config)
-    with safe_open(Path(path), framework="pt") as file:
-        policy.load_state_dict({key: file.get_tensor(key) for key in file.keys()})  # noqa: SIM118
+    try:
+        policy.load_state_dict(load_file(path))
+    except RuntimeError as error:
+        raise ValueError(f"policy: the weights in {path} do not fit its header ({error})") from error
     return policy.eval()

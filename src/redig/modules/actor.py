@@ -136,7 +136,7 @@ def _bounds(spec: TensorSpec) -> tuple[Tensor, Tensor]:
     """Lower and upper bounds ``[A]`` of an action spec ``[*B, A]``."""
     space = getattr(spec, "space", None)
     low, high = getattr(space, "low", None), getattr(space, "high", None)
-    if low is None or high is None or not (torch.isfinite(low).all() and torch.isfinite(high).all()):
+    if low is None or high is None or not torch.isfinite(high - low).all():
         raise ValueError(f"action_spec: got {type(spec).__name__} without finite bounds; use torchrl.data.Bounded")
     low, high = low.reshape(-1, low.shape[-1]), high.reshape(-1, high.shape[-1])
     if not ((low == low[0]).all() and (high == high[0]).all()):

@@ -20,7 +20,8 @@ def radius_adjacency(position: Tensor, radius: float) -> Tensor:
         >>> radius_adjacency(torch.tensor([[0.0, 0.0], [1.0, 0.0], [9.0, 0.0]]), 2.0).sum().item()
         2
     """
-    near = torch.cdist(position, position) <= radius
+    # the matrix product that cdist prefers for many points loses digits far from the origin
+    near = torch.cdist(position, position, compute_mode="donot_use_mm_for_euclid_dist") <= radius
     return near & ~torch.eye(position.shape[-2], dtype=torch.bool, device=position.device)
 
 

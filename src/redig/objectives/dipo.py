@@ -163,6 +163,12 @@ class DIPOLoss(LossModule):
             raise ValueError(f"refine_steps: got {refine_steps}, must be at least 0")
         if refine_max_norm is not None and not refine_max_norm > 0:
             raise ValueError(f"refine_max_norm: got {refine_max_norm}, must be greater than 0 or None")
+        if num_qvalue_nets < 1:
+            raise ValueError(f"num_qvalue_nets: got {num_qvalue_nets}, must be at least 1")
+        if reduction not in ("mean", "sum", "none"):
+            raise ValueError(f"reduction: got {reduction!r}, allowed are mean, sum, none")
+        if critic_encoder is not None and encoder is None:
+            raise ValueError("critic_encoder: without an encoder of the actor, put it into the critic's own network")
         if detach_encoder and critic_encoder is not None:
             raise ValueError("detach_encoder: a separate critic_encoder leaves no shared encoder to detach")
         if loss_function not in ("l2", "smooth_l1"):
@@ -348,7 +354,7 @@ class DIPOLoss(LossModule):
         self, loss: Tensor, tensordict: TensorDictBase, weights: Tensor | None, mask: Tensor | None = None
     ) -> Tensor:
         if weights is not None:
-            weights = weights.reshape(*tensordict.shape, *[1] * (loss.ndim - tensordict.ndim))
+            weights = weights.reshape(*tensordict.shape, *[1] * (loss.ndim - tensordict.ndim)).expand_as(loss)
         return self._reduce_loss(loss, tensordict=tensordict, weights=weights, mask=mask)
 
 
