@@ -8,8 +8,12 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-# too much of it, and a team keeps its shape rather than arrive
-FORMATION_WEIGHT = {"wedge": 2.5, "line": 1.0, "circle": 2.0}
+# What suits each formation: too much weight, and a team keeps its shape rather than arrive; the bonus hurries it on.
+REWARD: dict[str, dict[str, Any]] = {
+    "wedge": {"formation_weight": 2.5, "arrival_bonus": 20.0},
+    "line": {"formation_weight": 1.0, "arrival_bonus": 10.0},
+    "circle": {"formation_weight": 2.0, "arrival_bonus": 20.0},
+}
 SMOKE: dict[str, Any] = {  # the whole program in under a minute; it learns nothing
     "num_trajectories": 100, "clone_updates": 20, "critic_updates": 10, "warmup_steps": 20, "env_steps": 40,
     "evaluation_interval": 20, "evaluation_starts": 8, "num_starts": 8, "num_envs": 8, "hidden": 32,
@@ -62,8 +66,8 @@ class Config:
     """Balance of spring and damper in the spring-damper forms (paper: 0.5)."""
     navigation_reward: str = "progress"
     """progress or goal_speed (Eq. 30)."""
-    arrival_bonus: float = 10.0
-    """Paid once to a robot on arrival (paper: 15)."""
+    arrival_bonus: float | None = None
+    """Paid once to a robot on arrival (paper: 15); default: what suits the formation."""
     collision_penalty: float = 20.0
     """Penalty of a collision (paper: 1.5)."""
     proximity_penalty: float = 0.5
@@ -195,8 +199,9 @@ class Config:
             saved = json.loads(path.read_text())
             return dataclasses.replace(Config(**saved), resume=self.resume, out=None)
         config = dataclasses.replace(self, **SMOKE) if self.smoke else self
-        if config.formation_weight is None:
-            config = dataclasses.replace(config, formation_weight=FORMATION_WEIGHT.get(config.formation, 1.0))
+        for name, value in REWARD.get(config.formation, REWARD["wedge"]).items():
+            if getattr(config, name) is None:
+                config = dataclasses.replace(config, **{name: value})
         for name in (
             "num_trajectories", "clone_updates", "clone_batch", "num_envs", "collect_steps", "updates_per_step",
             "batch_size", "buffer_size", "evaluation_interval", "evaluation_starts", "num_starts", "hidden",

@@ -125,7 +125,8 @@ def read_header(path: str | Path) -> tuple[PolicyConfig, dict[str, Any]]:
         raise ValueError(f"policy: {path} has format {header.get('format')!r}, expected {FORMAT!r}")
     try:
         policy, environment = json.loads(header["policy"]), json.loads(header["environment"])
-        return PolicyConfig(**{k: tuple(v) if isinstance(v, list) else v for k, v in policy.items()}), environment
+        fields: dict[str, Any] = {k: tuple(v) if isinstance(v, list) else v for k, v in policy.items()}
+        return PolicyConfig(**fields), environment
     except (KeyError, TypeError, ValueError) as error:
         raise ValueError(f"policy: the header of {path} is damaged, or of another version ({error})") from error
 
