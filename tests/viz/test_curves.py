@@ -52,10 +52,22 @@ def test_lines_hold_the_data(monkeypatch, tmp_path):
 
 
 def test_bad_rows_and_suffix(tmp_path):
-    with pytest.raises(ValueError, match="rows: got none"):
+    with pytest.raises(ValueError, match="runs: got none"):
         plot_learning_curves(tmp_path / "curves.png", [])
+    with pytest.raises(ValueError, match="runs: they were evaluated after different numbers of updates"):
+        plot_learning_curves(tmp_path / "curves.png", [row(0), row(500)], [row(0), row(600)])
     with pytest.raises(ValueError, match=r"path: got 'curves.mp4'"):
         plot_learning_curves(tmp_path / "curves.mp4", [row(0)])
     with pytest.raises(KeyError, match="jerk_mean"):
         plot_learning_curves(tmp_path / "curves.png", [{k: v for k, v in row(0).items() if k != "jerk_mean"}])
     assert list(tmp_path.iterdir()) == []
+
+
+def test_several_runs_are_drawn_with_their_mean(monkeypatch, tmp_path):
+    from matplotlib.figure import Figure
+
+    figures = []
+    monkeypatch.setattr(Figure, "savefig", lambda self, path, **_: (figures.append(self), path.write_text("")))
+    plot_learning_curves(tmp_path / "curves.png", [row(0, 9.0), row(500, 8.0)], [row(0, 11.0), row(500, 6.0)])
+    lines = [list(line.get_ydata()) for line in figures[0].axes[1].lines]
+    assert [9.0, 8.0] in lines and [11.0, 6.0] in lines and [10.0, 7.0] in lines
