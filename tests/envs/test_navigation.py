@@ -362,6 +362,7 @@ def test_a_saved_state_continues_as_if_nothing_had_happened():
             for value in (0.0, math.nan)
         ),
         ({"start_distance": -2.0}, r"start_distance: got -2\.0, must be greater than 0"),
+        ({"max_speed": 1.5}, r"max_speed: got 1\.5 m/s, .* more than its radius \(0\.1 m\)"),
     ],
 )
 def test_bad_arguments_are_named(arguments, message):
