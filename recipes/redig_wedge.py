@@ -51,8 +51,8 @@ def train(config: Config) -> dict[str, float]:
     policy_config = policy_architecture(config, env.observation_spec[OBSERVATION].shape[-1])
     learner = build_policy(policy_config)
     loss = make_loss(config, policy_config, learner)
-    policy = averaged_policy(loss, policy_config) if config.act_with_target else learner
     target = SoftUpdate(loss, tau=config.tau)
+    policy = averaged_policy(loss, policy_config) if config.act_with_target else learner
     actor_optimizer, critic_optimizer = make_optimizers(config, loss)
     folder = config.resume or config.out or Path("runs") / f"{config.formation}-seed{config.seed}"
     run = Run(folder, config, config.logger, resume=config.resume is not None)

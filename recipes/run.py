@@ -92,22 +92,22 @@ class Run:
             self.saved = None
 
     def step(self, loss: Tensor, optimizer: torch.optim.Optimizer, max_norm: float, name: str) -> None:
-        """One step of an optimiser, with clipped gradients; a loss that is not finite stops the run.
+        """One step of an optimiser, with clipped gradients; a loss or gradient that is not finite stops the run.
 
         Raises:
-            FloatingPointError: naming the loss; the last good checkpoint is kept.
+            FloatingPointError: naming the loss; the weights are untouched and the last good checkpoint is kept.
         """
-        value = loss.item()
-        if not math.isfinite(value):
-            raise FloatingPointError(
-                f"{name} is {value} after {self.counters}; the last good checkpoint is kept in "
-                f"{self.folder / 'checkpoint.pt'}. Lower the learning rates or refine_step_size and start again"
-            )
         optimizer.zero_grad()
         loss.backward()
-        torch.nn.utils.clip_grad_norm_(optimizer.param_groups[0]["params"], max_norm)
+        norm = torch.nn.utils.clip_grad_norm_(optimizer.param_groups[0]["params"], max_norm)
+        for what, value in ((name, loss.item()), (f"the gradient of {name}", norm.item())):
+            if not math.isfinite(value):
+                raise FloatingPointError(
+                    f"{what} is {value} after {self.counters}; the last good checkpoint is kept in "
+                    f"{self.folder / 'checkpoint.pt'}. Lower the learning rates or refine_step_size and start again"
+                )
         optimizer.step()
-        self.figures[name] = value
+        self.figures[name] = loss.item()
 
     def loop(self, phase: str, total: int, checkpoint_every: int | None = None) -> Iterator[int]:
         """Count ``phase`` up to ``total`` from where the checkpoint left it, with a progress bar.

@@ -13,6 +13,7 @@ import torch
 from config import SMOKE, Config
 from conftest import command
 from PIL import Image
+from run import Run
 
 from redig.checkpoint import load_checkpoint
 from redig.policy import load_policy
@@ -116,6 +117,14 @@ def test_a_loss_that_is_not_finite_stops_the_run(tmp_path):
     config = Config(smoke=True, out=tmp_path / "run", clone_lr=math.inf)
     with pytest.raises(FloatingPointError, match=r"loss_pi is (nan|inf).*checkpoint"):
         redig_wedge.train(config)
+
+
+def test_a_gradient_that_is_not_finite_leaves_the_weights_alone(tmp_path):
+    run = Run(tmp_path / "run", Config(), "csv")
+    weight = torch.nn.Parameter(torch.zeros(1))
+    with pytest.raises(FloatingPointError, match="the gradient of loss_q is (nan|inf)"):
+        run.step(weight.sqrt().sum(), torch.optim.SGD([weight], 0.1), 2.0, "loss_q")
+    assert weight.item() == 0.0
 
 
 def test_a_run_is_not_overwritten(smoke):
