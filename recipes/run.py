@@ -137,7 +137,7 @@ class Run:
                 signal.signal(number, handler)
 
     def log(self, figures: dict[str, float], step: int, prefix: str = "") -> None:
-        """Send figures to the logger and to the progress bar."""
+        """Send figures to the logger."""
         for name, value in figures.items():
             self.logger.log_scalar(f"{prefix}{name}", value, step=step)
 
