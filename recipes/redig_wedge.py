@@ -227,7 +227,7 @@ def learning_rate(optimizer: torch.optim.Optimizer, rate: float) -> None:
 
 
 def averaged_policy(loss: DIPOLoss, architecture: PolicyConfig) -> TensorDictSequential:
-    """The policy with the target networks' weights: the Polyak average of the learner, which is far steadier."""
+    """The policy with the target networks' weights: the Polyak average of the learner, which swings less."""
     policy = build_policy(architecture)
     loss.target_encoder_network_params.to_module(policy[0])
     loss.target_actor_network_params.to_module(policy[1])

@@ -129,7 +129,6 @@ class Run:
                 if due or self._stop.is_set() or step + 1 == total:
                     self.checkpoint()
                 if self._stop.is_set():
-                    bar.close()
                     raise SystemExit(f"stopped at {phase} {step + 1}; continue with --resume {self.folder}")
         finally:
             bar.close()
