@@ -13,7 +13,7 @@ def exact(schedule, expected_clean):
     """The denoiser that knows the data: eps from E[a0 | a^k], which ``expected_clean(a^k, alpha)`` gives."""
 
     def denoise(action, step):
-        alpha = schedule.alphas_cumprod[step]
+        alpha = torch.tensor(schedule.signal(step), dtype=action.dtype)
         return (action - alpha.sqrt() * expected_clean(action, alpha)) / (1 - alpha).sqrt()
 
     return denoise
@@ -77,7 +77,7 @@ def reference(sampler, schedule, latent, noise, deterministic):
     count = sampler.num_steps or total
     chain = [math.ceil(total * (i + 1) / count) - 1 for i in range(count)][::-1]
     calls = min(sampler.early_stop or count, count)
-    alphas = schedule.alphas_cumprod.double().tolist()
+    alphas = [schedule.signal(step) for step in range(total)]
     result = torch.empty_like(latent)
     for row in range(latent.shape[0]):
         action = latent[row].tolist()

@@ -4,15 +4,18 @@ from redig.modules.actor import DiffusionActor
 from redig.modules.critic import QNetwork
 from redig.modules.denoiser import DenoisingMLP
 from redig.modules.encoder import GraphEncoder, radius_adjacency
-from redig.modules.samplers import DDPM
+from redig.modules.samplers import DDIM, DDPM, DPMSolver, Sampler
 from redig.modules.schedule import NoiseSchedule
 
 __all__ = [
+    "DDIM",
     "DDPM",
+    "DPMSolver",
     "DenoisingMLP",
     "DiffusionActor",
     "GraphEncoder",
     "NoiseSchedule",
     "QNetwork",
+    "Sampler",
     "radius_adjacency",
 ]

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor, nn
 
-from redig.modules.denoiser import mlp
+from redig.modules.denoiser import check_shapes, mlp
 
 
 class QNetwork(nn.Module):
@@ -36,8 +36,14 @@ class QNetwork(nn.Module):
         activation: str = "mish",
     ) -> None:
         super().__init__()
+        self.embedding_dim, self.action_dim = embedding_dim, action_dim
         self.net = mlp(embedding_dim + action_dim, hidden, 1, activation, layer_norm)
 
     def forward(self, embedding: Tensor, action: Tensor) -> Tensor:
-        """Value ``[*B, 1]`` of actions ``[*B, A]`` given embeddings ``[*B, H]``."""
+        """Value ``[*B, 1]`` of actions ``[*B, A]`` given embeddings ``[*B, H]``.
+
+        Raises:
+            ValueError: if the shapes do not fit each other or the network.
+        """
+        check_shapes(action, self.action_dim, embedding, self.embedding_dim)
         return self.net(torch.cat([embedding, action], -1))

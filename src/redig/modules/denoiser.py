@@ -18,6 +18,14 @@ def mlp(
 
     Raises:
         ValueError: for an unknown activation.
+
+    Examples:
+        >>> mlp(3, (8,), 1, "relu")
+        Sequential(
+          (0): Linear(in_features=3, out_features=8, bias=True)
+          (1): ReLU()
+          (2): Linear(in_features=8, out_features=1, bias=True)
+        )
     """
     if activation not in ACTIVATIONS:
         raise ValueError(f"activation: got {activation!r}, allowed are {', '.join(ACTIVATIONS)}")
@@ -43,6 +51,29 @@ def sinusoidal_embedding(step: Tensor, dim: int, max_period: float = 10_000.0) -
     frequency = torch.exp(-math.log(max_period) * torch.arange(half, device=step.device) / max(half - 1, 1))
     angle = step.unsqueeze(-1) * frequency
     return torch.cat([angle.sin(), angle.cos()], -1)
+
+
+def check_shapes(action: Tensor, action_dim: int, embedding: Tensor, embedding_dim: int) -> None:
+    """Check that actions ``[*B, A]`` and embeddings ``[*B, H]`` fit each other and a network built for A and H.
+
+    Raises:
+        ValueError: if they do not; it names the shapes seen and expected.
+
+    Examples:
+        >>> import torch
+        >>> check_shapes(torch.zeros(8, 5, 2), 2, torch.zeros(8, 4, 64), 64)
+        Traceback (most recent call last):
+        ...
+        ValueError: embedding: got shape [8, 4, 64], expected [8, 5, 64] to go with the action's shape [8, 5, 2]
+    """
+    if action.shape[-1:] != (action_dim,):
+        raise ValueError(f"action: got shape {list(action.shape)}, expected [*B, {action_dim}]")
+    expected = [*action.shape[:-1], embedding_dim]
+    if list(embedding.shape) != expected:
+        raise ValueError(
+            f"embedding: got shape {list(embedding.shape)}, expected {expected} to go with the action's shape "
+            f"{list(action.shape)}"
+        )
 
 
 class DenoisingMLP(nn.Module):
@@ -73,7 +104,7 @@ class DenoisingMLP(nn.Module):
         super().__init__()
         if step_dim < 2 or step_dim % 2:
             raise ValueError(f"step_dim: got {step_dim}, must be even and at least 2")
-        self.action_dim = action_dim
+        self.action_dim, self.embedding_dim = action_dim, embedding_dim
         self.step_dim = step_dim
         self.net = mlp(action_dim + step_dim + embedding_dim, hidden, action_dim, activation)
 
@@ -87,7 +118,11 @@ class DenoisingMLP(nn.Module):
 
         Returns:
             noise ``[*B, A]``.
+
+        Raises:
+            ValueError: if the shapes do not fit each other or the network.
         """
-        time = sinusoidal_embedding(step.to(action.dtype), self.step_dim)
+        check_shapes(action, self.action_dim, embedding, self.embedding_dim)
+        time = sinusoidal_embedding(step.float(), self.step_dim).to(action.dtype)  # half types merge high steps
         time = time.expand(*action.shape[:-1], self.step_dim)
         return self.net(torch.cat([action, time, embedding], -1))

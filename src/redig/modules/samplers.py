@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import ClassVar
 
 import torch
 from torch import Tensor
@@ -16,8 +17,113 @@ Denoise = Callable[[Tensor, int], Tensor]
 
 
 @dataclass(frozen=True)
-class DDPM:
-    """Ancestral sampling with the exact posterior (Eq. 7) and ``a^0`` clamped to the action range at each step.
+class Sampler:
+    """The chain that all samplers share: estimate the clean action, clamp it to [-1, 1], go to the next lower step.
+
+    A sampler of one's own gives :meth:`coefficients`.
+
+    Args:
+        num_steps: steps that are taken, spread evenly over the schedule; ``None`` takes all of them.
+
+    Raises:
+        ValueError: if a number of steps is not positive or more than there are.
+    """
+
+    num_steps: int | None = None
+
+    name: ClassVar[str]
+
+    def __post_init__(self) -> None:
+        self._check_count("num_steps")
+
+    def _check_count(self, name: str) -> None:
+        value = getattr(self, name)
+        if value is not None and value < 1:
+            raise ValueError(f"{name}: got {value}, must be at least 1")
+
+    def timesteps(self, schedule: NoiseSchedule) -> list[int]:
+        """Steps of the chain, noisiest first."""
+        total = schedule.num_steps
+        count = self.num_steps or total
+        if count > total:
+            raise ValueError(f"num_steps: the sampler asks for {count} steps, the schedule has {total}")
+        return [math.ceil(total * (i + 1) / count) - 1 for i in reversed(range(count))]
+
+    def coefficients(
+        self, schedule: NoiseSchedule, step: int, previous: int, older: int | None, deterministic: bool
+    ) -> tuple[float, float, float, float]:
+        """One transition from ``step`` to ``previous``, the next lower step of the chain.
+
+        Args:
+            schedule: the noise schedule.
+            step: where the chain is.
+            previous: where it goes.
+            older: the step before ``step`` in the chain, ``None`` at its start.
+            deterministic: whether noise is unwanted.
+
+        Returns:
+            ``(clean, action, older_clean, noise)``: factors of the estimate of ``a^0`` at this step, of ``a^step``, of
+            the estimate of ``a^0`` at the step before, and of fresh noise.
+        """
+        raise NotImplementedError
+
+    def __call__(
+        self,
+        denoise: Denoise,
+        latent: Tensor,
+        schedule: NoiseSchedule,
+        generator: torch.Generator | None = None,
+        deterministic: bool = False,
+        start: int | None = None,
+    ) -> Tensor:
+        """Run the chain.
+
+        Args:
+            denoise: noise prediction.
+            latent: ``a^K``, ``[*B, A]``; or ``a^start``.
+            schedule: the schedule that the denoiser was trained with.
+            generator: source of the noise.
+            deterministic: add no noise, whatever the sampler's options say.
+            start: take only the steps of the chain up to this one (warm start).
+
+        Returns:
+            action ``[*B, A]`` in [-1, 1].
+
+        Raises:
+            ValueError: if no step of the chain is at or below ``start``, or the latent's type cannot hold the smallest
+                coefficient of the schedule (float16 with a long schedule).
+        """
+        steps = self.timesteps(schedule)
+        if start is not None:
+            steps = [step for step in steps if step <= start]
+            if not steps:
+                raise ValueError(f"start: got {start}, the chain's lowest step is {self.timesteps(schedule)[-1]}")
+        smallest = math.sqrt(schedule.signal(steps[0]))
+        if smallest < torch.finfo(latent.dtype).tiny:
+            raise ValueError(
+                f"latent: {latent.dtype} cannot hold sqrt(alphas_cumprod[{steps[0]}]) = {smallest:.1e} of the schedule; "
+                "run the chain in float32 (DiffusionActor does, whatever the type of its network)"
+            )
+        action, older_clean, older = latent, latent, None
+        for i, step in enumerate(steps):
+            signal = schedule.signal(step)
+            clean = (action - math.sqrt(1 - signal) * denoise(action, step)) / math.sqrt(signal)
+            clean = clean.clamp(-1, 1)
+            if i + 1 == len(steps):
+                break
+            c0, ck, c_older, sigma = self.coefficients(schedule, step, steps[i + 1], older, deterministic)
+            action = c0 * clean + ck * action
+            if c_older:
+                action = action + c_older * older_clean
+            if sigma > 0 and not deterministic:
+                action = action + sigma * torch.empty_like(action).normal_(generator=generator)
+            older_clean, older = clean, step
+        return clean
+
+
+@dataclass(frozen=True)
+class DDPM(Sampler):
+    """Ancestral sampling with the exact posterior (Eq. 7; Ho et al., 2020).
 
     Args:
         num_steps: steps that are taken, spread evenly over the schedule; ``None`` takes all of them.
@@ -35,58 +141,108 @@ class DDPM:
         torch.Size([3, 2])
     """
 
-    num_steps: int | None = None
     noise_ratio: float = 1.0
     early_stop: int | None = None
 
+    name = "ddpm"
+
     def __post_init__(self) -> None:
-        for name in ("num_steps", "early_stop"):
-            value = getattr(self, name)
-            if value is not None and value < 1:
-                raise ValueError(f"{name}: got {value}, must be at least 1")
+        super().__post_init__()
+        self._check_count("early_stop")
         if self.noise_ratio < 0:
             raise ValueError(f"noise_ratio: got {self.noise_ratio}, must be at least 0")
 
     def timesteps(self, schedule: NoiseSchedule) -> list[int]:
-        """Steps of the chain, noisiest first."""
-        total = schedule.num_steps
-        count = self.num_steps or total
-        if count > total:
-            raise ValueError(f"num_steps: the sampler asks for {count} steps, the schedule has {total}")
-        return [math.ceil(total * (i + 1) / count) - 1 for i in reversed(range(count))]
+        """Steps of the chain until it stops, noisiest first."""
+        return super().timesteps(schedule)[: self.early_stop]
 
-    def __call__(
-        self,
-        denoise: Denoise,
-        latent: Tensor,
-        schedule: NoiseSchedule,
-        generator: torch.Generator | None = None,
-        deterministic: bool = False,
-    ) -> Tensor:
-        """Run the chain.
+    def coefficients(
+        self, schedule: NoiseSchedule, step: int, previous: int, older: int | None, deterministic: bool
+    ) -> tuple[float, float, float, float]:
+        """Mean and noise of the posterior, see :meth:`Sampler.coefficients`."""
+        c0, ck, sigma = schedule.posterior(step, previous)
+        return c0, ck, 0.0, self.noise_ratio * sigma
 
-        Args:
-            denoise: noise prediction.
-            latent: ``a^K``, ``[*B, A]``.
-            schedule: the schedule that the denoiser was trained with.
-            generator: source of the noise.
-            deterministic: add no noise, whatever ``noise_ratio`` says.
 
-        Returns:
-            action ``[*B, A]`` in [-1, 1].
-        """
-        steps = self.timesteps(schedule)
-        last = len(steps) - 1 if self.early_stop is None else min(self.early_stop, len(steps)) - 1
-        action = latent
-        for i, step in enumerate(steps[: last + 1]):
-            alpha = schedule.alphas_cumprod[step]
-            clean = (action - (1 - alpha).sqrt() * denoise(action, step)) / alpha.sqrt()
-            clean = clean.clamp(-1, 1)
-            if i == last:
-                return clean
-            c0, ck, sigma = schedule.posterior(step, steps[i + 1])
-            action = c0 * clean + ck * action
-            if self.noise_ratio > 0 and not deterministic:
-                noise = torch.empty_like(action).normal_(generator=generator)
-                action = action + self.noise_ratio * sigma * noise
-        return action
+@dataclass(frozen=True)
+class DDIM(Sampler):
+    """Denoising diffusion implicit models (Song et al., 2021), good with fewer steps than DDPM.
+
+    The predicted noise is taken anew from the clamped estimate of ``a^0``, so that clamping does not leave the path.
+
+    Args:
+        num_steps: steps that are taken, spread evenly over the schedule; ``None`` takes all of them.
+        eta: noise, from 0 (none: the action is a function of the latent) to 1 (as much as DDPM).
+
+    Raises:
+        ValueError: if a number of steps is not positive or more than there are, or ``eta`` is not in [0, 1].
+
+    Examples:
+        >>> import torch
+        >>> from redig.modules import NoiseSchedule
+        >>> point = lambda action, step: (action - 0.5 * schedule.signal(step) ** 0.5) / (1 - schedule.signal(step)) ** 0.5
+        >>> schedule = NoiseSchedule(100)
+        >>> DDIM(num_steps=4)(point, torch.randn(1, 2), schedule)  # exact noise of data that is 0.5 everywhere
+        tensor([[0.5000, 0.5000]])
+    """
+
+    eta: float = 0.0
+
+    name = "ddim"
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if not 0 <= self.eta <= 1:
+            raise ValueError(f"eta: got {self.eta}, must be in [0, 1]")
+
+    def coefficients(
+        self, schedule: NoiseSchedule, step: int, previous: int, older: int | None, deterministic: bool
+    ) -> tuple[float, float, float, float]:
+        """Eq. 12 of the DDIM paper, see :meth:`Sampler.coefficients`; without noise where it is unwanted."""
+        sigma = 0.0 if deterministic else self.eta * schedule.posterior(step, previous)[2]
+        signal, signal_previous = schedule.signal(step), schedule.signal(previous)
+        ck = math.sqrt(max(1 - signal_previous - sigma**2, 0.0) / (1 - signal))
+        return math.sqrt(signal_previous) - ck * math.sqrt(signal), ck, 0.0, sigma
+
+
+@dataclass(frozen=True)
+class DPMSolver(Sampler):
+    """DPM-Solver++(2M) (Lu et al., 2022): second-order multistep solver of the probability-flow ODE, without noise.
+
+    Its first and last steps are of first order, as the paper recommends for few steps.
+
+    Args:
+        num_steps: steps that are taken, spread evenly over the schedule; ``None`` takes all of them.
+
+    Raises:
+        ValueError: if the number of steps is not positive or more than there are.
+
+    Examples:
+        >>> import torch
+        >>> from redig.modules import NoiseSchedule
+        >>> toward = lambda action, step: torch.zeros_like(action)
+        >>> DPMSolver(num_steps=5)(toward, torch.ones(3, 2), NoiseSchedule(100)).shape
+        torch.Size([3, 2])
+    """
+
+    name = "dpmsolver"
+
+    def coefficients(
+        self, schedule: NoiseSchedule, step: int, previous: int, older: int | None, deterministic: bool
+    ) -> tuple[float, float, float, float]:
+        """Eq. 4.1 of the DPM-Solver++ paper in half log-SNR, see :meth:`Sampler.coefficients`."""
+        signal, signal_previous = schedule.signal(step), schedule.signal(previous)
+        h = _half_log_snr(signal_previous) - _half_log_snr(signal)
+        gain = -math.sqrt(signal_previous) * math.expm1(-h)
+        ck = math.sqrt((1 - signal_previous) / (1 - signal))
+        if older is None:
+            return gain, ck, 0.0, 0.0
+        ratio = (_half_log_snr(signal) - _half_log_snr(schedule.signal(older))) / h
+        return gain * (1 + 0.5 / ratio), ck, -gain * 0.5 / ratio, 0.0
+
+
+def _half_log_snr(signal: float) -> float:
+    return 0.5 * math.log(signal / (1 - signal))
+
+
+SAMPLERS: dict[str, type[Sampler]] = {sampler.name: sampler for sampler in (DDPM, DDIM, DPMSolver)}

@@ -3,11 +3,14 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
+from typing import TypeVar
 
 import torch
 from torch import Tensor, nn
 
 SCHEDULES = ("cosine", "linear", "vp")
+ModuleT = TypeVar("ModuleT", bound=nn.Module)
 
 
 class NoiseSchedule(nn.Module):
@@ -17,13 +20,16 @@ class NoiseSchedule(nn.Module):
     paper's alpha with a superscript. The paper's ``lambda^k (a^k - alpha^k eps)`` is not the mean of Eq. 7; the exact
     posterior is used instead (``docs/paper.md``).
 
+    The variances stay in float32 or better when the module around them is moved to half precision, where the smallest
+    would underflow; chains take them as Python numbers.
+
     Args:
         num_steps: K, number of diffusion steps.
         kind: ``"cosine"`` (Nichol and Dhariwal, 2021), ``"linear"`` (Ho et al., 2020; betas 1e-4 to 0.02, which leave
             some signal at the last step unless K is about 1,000) or ``"vp"`` (variance preserving, as in DIPO).
 
     Raises:
-        ValueError: for an unknown kind or fewer than one step.
+        ValueError: for an unknown kind, fewer than one step, or a state dict of another schedule.
 
     Examples:
         >>> schedule = NoiseSchedule(100, "cosine")
@@ -54,8 +60,32 @@ class NoiseSchedule(nn.Module):
         else:
             low, high = 0.1, 10.0
             betas = 1 - torch.exp(-low / num_steps - (high - low) * (2 * step + 1) / (2 * num_steps**2))
+        alphas_cumprod = (1 - betas).cumprod(0)
+        self._signal: tuple[float, ...] = (*alphas_cumprod.tolist(), 1.0)  # the last stands for the clean action, -1
         self.register_buffer("betas", betas.float())
-        self.register_buffer("alphas_cumprod", (1 - betas).cumprod(0).float())
+        self.register_buffer("alphas_cumprod", alphas_cumprod.float())
+
+    def _apply(self, fn: Callable[[Tensor], Tensor], recurse: bool = True) -> NoiseSchedule:
+        return keep_precision(self, super()._apply, fn, recurse)
+
+    def _load_from_state_dict(self, state_dict, prefix, *args) -> None:
+        super()._load_from_state_dict(state_dict, prefix, *args)
+        loaded = state_dict.get(f"{prefix}alphas_cumprod", self.alphas_cumprod).double().cpu()
+        expected = torch.tensor(self._signal[:-1], dtype=torch.float64)
+        if loaded.shape != expected.shape or not torch.allclose(loaded, expected, rtol=1e-2, atol=1e-12):
+            raise ValueError(
+                f"schedule: the weights are of another schedule than {self.kind!r} of {self.num_steps} steps"
+            )
+
+    def signal(self, step: int) -> float:
+        """``alphas_cumprod[step]`` as a Python number in double precision; 1 for the clean action, step -1.
+
+        Raises:
+            ValueError: if ``-1 <= step < num_steps`` does not hold.
+        """
+        if not -1 <= step < self.num_steps:
+            raise ValueError(f"step: got {step}, need -1 <= step < {self.num_steps}")
+        return self._signal[step]
 
     def add_noise(self, action: Tensor, noise: Tensor, step: Tensor) -> Tensor:
         """Forward process, Eq. 9: ``sqrt(alpha) a0 + sqrt(1 - alpha) eps``.
@@ -66,8 +96,16 @@ class NoiseSchedule(nn.Module):
             step: ``[*B]``, integers in ``[0, num_steps)``.
 
         Returns:
-            noisy action ``[*B, A]``.
+            noisy action ``[*B, A]``, in float32 or better.
+
+        Raises:
+            ValueError: if the shapes do not fit each other.
         """
+        if noise.shape != action.shape or step.shape != action.shape[:-1]:
+            raise ValueError(
+                f"step: got shape {list(step.shape)} for actions {list(action.shape)} and noise {list(noise.shape)}, "
+                f"expected {list(action.shape[:-1])} and noise like the actions"
+            )
         alpha = self.alphas_cumprod[step].unsqueeze(-1)
         return alpha.sqrt() * action + (1 - alpha).sqrt() * noise
 
@@ -86,10 +124,20 @@ class NoiseSchedule(nn.Module):
         """
         if not -1 <= previous < step < self.num_steps:
             raise ValueError(f"step, previous: got {step}, {previous}, need -1 <= previous < step < {self.num_steps}")
-        alpha = self.alphas_cumprod[step].item()
-        alpha_previous = 1.0 if previous < 0 else self.alphas_cumprod[previous].item()
+        alpha, alpha_previous = self.signal(step), self.signal(previous)
         ratio = alpha / alpha_previous
         c0 = math.sqrt(alpha_previous) * (1 - ratio) / (1 - alpha)
         ck = math.sqrt(ratio) * (1 - alpha_previous) / (1 - alpha)
         sigma = math.sqrt((1 - ratio) * (1 - alpha_previous) / (1 - alpha))
         return c0, ck, sigma
+
+
+def keep_precision(module: ModuleT, apply: Callable, fn: Callable[[Tensor], Tensor], recurse: bool) -> ModuleT:
+    """``nn.Module._apply`` that moves the module's own buffers to another device, but never below float32."""
+    before = dict(module._buffers)
+    apply(fn, recurse)
+    for name, buffer in before.items():
+        moved = module._buffers[name]
+        if buffer is not None and moved is not None and moved.dtype in (torch.float16, torch.bfloat16):
+            module._buffers[name] = buffer.to(moved.device)
+    return module

@@ -6,62 +6,52 @@ from dataclasses import dataclass
 from typing import ClassVar
 
 import torch
-from tensordict import TensorDict, TensorDictBase, TensorDictParams
-from tensordict.nn import TensorDictModule, dispatch
+from tensordict import TensorDictBase
+from tensordict.nn import TensorDictModule
 from tensordict.utils import NestedKey
 from torch import Tensor
-from torchrl.envs.utils import ExplorationType, set_exploration_type
-from torchrl.objectives import LossModule, ValueEstimators
-from torchrl.objectives.utils import _vmap_func, default_value_kwargs, distance_loss
-from torchrl.objectives.value import TD0Estimator, TD1Estimator, TDLambdaEstimator
 
-from redig.objectives.refinement import refine_actions
+from redig.objectives.actor_critic import DiffusionActorCriticLoss
+from redig.objectives.refinement import check_refinement, refine_actions
 
-_ESTIMATORS = {
-    ValueEstimators.TD0: TD0Estimator,
-    ValueEstimators.TD1: TD1Estimator,
-    ValueEstimators.TDLambda: TDLambdaEstimator,
-}
 REFINE_FROM = ("stored", "policy")
 
 
-class DIPOLoss(LossModule):
+class DIPOLoss(DiffusionActorCriticLoss):
     """Diffusion policy improvement (Yang et al., 2023) on graph embeddings: lines 9 to 13 of Algorithm 1.
 
-    * ``loss_qvalue`` (Eq. 2): TD error of the twin critics, ``y = r + gamma min(Q1', Q2')(h', a')`` with target
-      networks and ``a'`` from the target actor.
+    * ``loss_qvalue`` (Eq. 2): TD error of the twin critics, see
+      :class:`~redig.objectives.DiffusionActorCriticLoss`, which also explains the arguments not listed here.
     * refinement (Sec. 3.2.2): ``a <- a + eta grad_a min(Q1, Q2)(h, a)``, ``refine_steps`` times.
     * ``loss_actor`` (Eq. 1): diffusion loss of the actor on the refined actions.
 
-    Rewards and done flags may be per robot, ``[*B, n, 1]``, or per team, ``[*B, 1]``; a team's count for each robot.
-
-    Args:
-        encoder: TensorDictModule that writes the embedding which the actor reads, or ``None`` if actor and critic read
-            observations themselves.
-        actor: :class:`~redig.modules.DiffusionActor`.
-        qvalue: TensorDictModule ``(embedding, action) -> state_action_value``; copied ``num_qvalue_nets`` times.
-
-    Keyword Args:
-        critic_encoder: an encoder of the critic's own (same keys). Default ``None``: one encoder, trained by both
-            losses as in the paper.
-        detach_encoder: keep the critic's loss from reaching the shared encoder.
-        num_qvalue_nets: number of critics.
-        refine_steps: number of gradient steps on the action; 0 turns refinement off (behaviour cloning).
-        refine_step_size: eta, in the units of the action a unit of gradient.
-        refine_max_norm: limit on the distance between the refined and the original action (units of the action).
-        refine_from: ``"stored"`` refines the action of the batch (key ``base_action``), as DIPO does; ``"policy"``
-            refines actions freshly sampled from the actor, as Algorithm 1 reads.
-        loss_function: ``"l2"`` or ``"smooth_l1"`` for the TD error.
-        reduction: ``"mean"``, ``"sum"`` or ``"none"``.
-
     Transitions whose optional key ``demonstration`` (bool, ``[*B]`` or ``[*B, 1]``) is true are imitated as they are:
     their actions are not refined. It is the anchor that keeps online training from destroying a cloned policy.
+
+    DIPO as its authors run it: ``refine_steps=20, refine_optimizer="adam", refine_step_size=0.03,
+    refine_grad_norm=0.1 * A``, and improved actions kept in the buffer. For the last, store a copy of each action as
+    ``"best_action"``, set ``base_action`` and ``refined_action`` to that key, and write it back after each actor loss:
+    ``buffer.set_at_("best_action", batch["best_action"], batch["index"])`` on a storage of TensorDicts.
+
+    Args:
+        encoder, actor, qvalue: see :class:`~redig.objectives.DiffusionActorCriticLoss`.
+
+    Keyword Args:
+        refine_steps: number of gradient steps on the action; 0 turns refinement off (behaviour cloning).
+        refine_step_size: eta. This and the next two are for actions scaled to [-1, 1], that is in half ranges of the
+            action (with bounds of -1 and 1 m/s: in m/s).
+        refine_max_norm: limit on the distance between the refined and the original action.
+        refine_grad_norm: limit on the norm of the gradient of the whole batch.
+        refine_optimizer: ``"sgd"``, the paper's plain step, or ``"adam"``.
+        refine_from: ``"stored"`` refines the action of the batch (key ``base_action``), as DIPO does; ``"policy"``
+            refines actions freshly sampled from the actor, as Algorithm 1 reads.
+        **options: see :class:`~redig.objectives.DiffusionActorCriticLoss`.
 
     Forward writes ``td_error`` and ``refined_action`` into its input and returns ``loss_qvalue``, ``loss_actor``,
     ``pred_value``, ``target_value``, ``next_state_value`` and ``refine_distance`` (mean distance that actions moved).
 
     Raises:
-        ValueError: for arguments outside their range, or ``detach_encoder`` with a separate ``critic_encoder``.
+        ValueError: for arguments outside their range.
 
     Examples:
         >>> import torch
@@ -84,62 +74,21 @@ class DIPOLoss(LossModule):
     """
 
     @dataclass
-    class _AcceptedKeys:
-        """Keys that ``set_keys`` can rename; all may be nested.
+    class _AcceptedKeys(DiffusionActorCriticLoss._AcceptedKeys):
+        """Keys that ``set_keys`` can rename, beside the common ones; all may be nested.
 
         Attributes:
-            action: the action that was executed; the critic learns its value.
             base_action: the action to refine (default: ``action``); set it to where the collector keeps the policy's
-                action without exploration noise.
+                action without exploration noise, or to where improved actions are kept.
             refined_action: where the refined action is written.
-            state_action_value: output of the critic.
-            reward, done, terminated: under ``"next"``.
-            priority: where the TD error is written.
-            demonstration: flag of transitions to imitate as they are.
-            actor_mask: optional flag ``[*B, n, 1]`` of the robots whose action counts for the actor; false for one
-                whose action the environment did not carry out, such as a robot that has arrived and holds.
-            steps_to_next_obs: length of n-step windows.
         """
 
-        action: NestedKey = "action"
         base_action: NestedKey | None = None
         refined_action: NestedKey = "refined_action"
-        state_action_value: NestedKey = "state_action_value"
-        reward: NestedKey = "reward"
-        done: NestedKey = "done"
-        terminated: NestedKey = "terminated"
-        priority: NestedKey = "td_error"
-        priority_weight: NestedKey = "priority_weight"
-        demonstration: NestedKey = "demonstration"
-        actor_mask: NestedKey = "actor_mask"
-        steps_to_next_obs: NestedKey = "steps_to_next_obs"
 
     tensor_keys: _AcceptedKeys
     default_keys = _AcceptedKeys
-    default_value_estimator = ValueEstimators.TD0
-    # a diffusion target policy that starts from a zero latent is not the policy: sample it
-    deterministic_sampling_mode = ExplorationType.RANDOM
-    out_keys: ClassVar[list[NestedKey]] = [
-        "loss_qvalue",
-        "loss_actor",
-        "pred_value",
-        "target_value",
-        "next_state_value",
-        "refine_distance",
-    ]
-
-    encoder_network: TensorDictModule
-    encoder_network_params: TensorDictParams
-    target_encoder_network_params: TensorDictParams
-    critic_encoder_network: TensorDictModule
-    critic_encoder_network_params: TensorDictParams
-    target_critic_encoder_network_params: TensorDictParams
-    actor_network: TensorDictModule
-    actor_network_params: TensorDictParams
-    target_actor_network_params: TensorDictParams
-    qvalue_network: TensorDictModule
-    qvalue_network_params: TensorDictParams
-    target_qvalue_network_params: TensorDictParams
+    out_keys: ClassVar[list[NestedKey]] = [*DiffusionActorCriticLoss.out_keys, "refine_distance"]
 
     def __init__(
         self,
@@ -147,131 +96,48 @@ class DIPOLoss(LossModule):
         actor: TensorDictModule,
         qvalue: TensorDictModule,
         *,
-        critic_encoder: TensorDictModule | None = None,
-        detach_encoder: bool = False,
-        num_qvalue_nets: int = 2,
         refine_steps: int = 1,
         refine_step_size: float = 0.3,
         refine_max_norm: float | None = None,
+        refine_grad_norm: float | None = None,
+        refine_optimizer: str = "sgd",
         refine_from: str = "stored",
-        loss_function: str = "l2",
-        reduction: str = "mean",
+        **options,
     ) -> None:
         if refine_from not in REFINE_FROM:
             raise ValueError(f"refine_from: got {refine_from!r}, allowed are {', '.join(REFINE_FROM)}")
-        if refine_steps < 0:
-            raise ValueError(f"refine_steps: got {refine_steps}, must be at least 0")
-        if refine_max_norm is not None and not refine_max_norm > 0:
-            raise ValueError(f"refine_max_norm: got {refine_max_norm}, must be greater than 0 or None")
-        if num_qvalue_nets < 1:
-            raise ValueError(f"num_qvalue_nets: got {num_qvalue_nets}, must be at least 1")
-        if reduction not in ("mean", "sum", "none"):
-            raise ValueError(f"reduction: got {reduction!r}, allowed are mean, sum, none")
-        if critic_encoder is not None and encoder is None:
-            raise ValueError("critic_encoder: without an encoder of the actor, put it into the critic's own network")
-        if detach_encoder and critic_encoder is not None:
-            raise ValueError("detach_encoder: a separate critic_encoder leaves no shared encoder to detach")
-        if loss_function not in ("l2", "smooth_l1"):
-            raise ValueError(f"loss_function: got {loss_function!r}, allowed are l2, smooth_l1")
-        self._in_keys: list[NestedKey] | None = None
-        super().__init__()
-        self.has_encoder, self.separate_encoders = encoder is not None, critic_encoder is not None
-        if encoder is not None:
-            self.convert_to_functional(encoder, "encoder_network", create_target_params=True)
-        if critic_encoder is not None:
-            self.convert_to_functional(critic_encoder, "critic_encoder_network", create_target_params=True)
-        self.convert_to_functional(actor, "actor_network", create_target_params=True)
-        self.convert_to_functional(qvalue, "qvalue_network", num_qvalue_nets, create_target_params=True)
-        self.detach_encoder = detach_encoder
-        self.refine_steps, self.refine_step_size = refine_steps, refine_step_size
-        self.refine_max_norm, self.refine_from = refine_max_norm, refine_from
-        self.loss_function, self.reduction = loss_function, reduction
-        self._make_vmap()
-
-    def _make_vmap(self) -> None:
-        self._vmap_qvalue = _vmap_func(self.qvalue_network, (None, 0), randomness=self.vmap_randomness)
-
-    def _forward_value_estimator_keys(self, **kwargs) -> None:
-        if self._value_estimator is not None:
-            self._value_estimator.set_keys(reward="reward", done="done", terminated="terminated")
-        self._in_keys = None
-
-    @property
-    def in_keys(self) -> list[NestedKey]:
-        """Keys that a batch must have."""
-        if self._in_keys is None:
-            keys, first = self.tensor_keys, self.encoder_network if self.has_encoder else self.actor_network
-            states = list(dict.fromkeys([*first.in_keys, *filter(self._is_state, self.qvalue_network.in_keys)]))
-            self._in_keys = [keys.action, *states, *(_under_next(k) for k in states)]
-            self._in_keys += [_under_next(k) for k in (keys.reward, keys.done, keys.terminated)]
-        return self._in_keys
-
-    @in_keys.setter
-    def in_keys(self, values: list[NestedKey]) -> None:
-        self._in_keys = values
-
-    def _is_state(self, key: NestedKey) -> bool:
-        return key != self.tensor_keys.action and not (self.has_encoder and key in self.encoder_network.out_keys)
-
-    def make_value_estimator(self, value_type: ValueEstimators | None = None, **hyperparams) -> DIPOLoss:
-        """Choose how TD targets are made: TD0 (default; n-step with ``steps_to_next_obs``), TD1 or TD(lambda)."""
-        value_type = value_type or self.default_value_estimator
-        if value_type not in _ESTIMATORS:
-            raise ValueError(f"value_type: got {value_type}, allowed are {', '.join(str(v) for v in _ESTIMATORS)}")
-        self.value_type = value_type
-        hyperparams = {**default_value_kwargs(value_type), **hyperparams}
-        if hasattr(self, "gamma"):
-            hyperparams["gamma"] = self.gamma
-        self._value_estimator = _ESTIMATORS[value_type](value_network=None, **hyperparams)
-        self._forward_value_estimator_keys()
-        return self
-
-    @dispatch
-    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
-        """Both losses of a batch; ``loss_actor`` does not depend on the critics' parameters, nor the reverse."""
-        loss_qvalue, metadata = self.qvalue_loss(tensordict)
-        loss_actor, actor_metadata = self.actor_loss(tensordict)
-        return TensorDict({"loss_qvalue": loss_qvalue, "loss_actor": loss_actor, **metadata, **actor_metadata})
-
-    def qvalue_loss(self, tensordict: TensorDictBase) -> tuple[Tensor, dict[str, Tensor]]:
-        """TD error of all critics (Eq. 2), summed over critics, and what to log of it."""
-        keys = self.tensor_keys
-        target, next_value = self._target_value(tensordict)
-        embedding = self._critic_embedding(tensordict)
-        if self.detach_encoder:
-            embedding = embedding.detach()
-        value = self._qvalues(embedding, tensordict[keys.action], self.qvalue_network_params)
-        loss = distance_loss(value, target.expand_as(value), self.loss_function)
-        tensordict[keys.priority] = (value - target).detach().abs().mean(0)
-        weights = self._maybe_get_priority_weight(tensordict)
-        loss = self._reduce(loss.sum(0), tensordict, weights)
-        return loss, {
-            "pred_value": value.detach().mean(),
-            "target_value": target.mean(),
-            "next_state_value": next_value.mean(),
+        refinement = {
+            "steps": refine_steps,
+            "step_size": refine_step_size,
+            "max_norm": refine_max_norm,
+            "grad_norm": refine_grad_norm,
+            "optimizer": refine_optimizer,
         }
+        check_refinement(**refinement, prefix="refine_")
+        super().__init__(encoder, actor, qvalue, **options)
+        self.refinement, self.refine_from = refinement, refine_from
 
     def actor_loss(self, tensordict: TensorDictBase) -> tuple[Tensor, dict[str, Tensor]]:
         """Diffusion loss on refined actions (Eq. 1), and what to log of it."""
         keys = self.tensor_keys
+        base_key = keys.base_action or keys.action
+        self._require(tensordict, [*self._present_keys, *([base_key] if self.refine_from == "stored" else [])])
         embedding = self._embed(tensordict, "encoder_network")
         executed = tensordict[keys.action]
         if self.refine_from == "policy":
             with torch.no_grad():
                 base = self._sample_action(embedding, self.actor_network_params)
         else:
-            base = tensordict[keys.base_action or keys.action]
+            base = tensordict[base_key]
         refined = self.refine(tensordict, base)
         demonstration = tensordict.get(keys.demonstration, None)
         if demonstration is not None:
             demonstration = demonstration.reshape(*tensordict.shape, *[1] * (refined.ndim - tensordict.ndim))
             refined, base = refined.where(~demonstration, executed), base.where(~demonstration, executed)
         tensordict[keys.refined_action] = refined
-        with self.actor_network_params.to_module(self.actor_network, preserve_module_state=False):
-            conditions = [embedding[key] for key in self.actor_network.in_keys]
-            error = self.actor_network.module.denoising_error(refined, *conditions)
         weights = self._maybe_get_priority_weight(tensordict)
-        loss = self._reduce(error.unsqueeze(-1), tensordict, weights, tensordict.get(keys.actor_mask, None))
+        error = self._denoising_error(embedding, refined)
+        loss = self._reduce(error, tensordict, weights, tensordict.get(keys.actor_mask, None))
         return loss, {"refine_distance": (refined - base).norm(dim=-1).mean()}
 
     def refine(self, tensordict: TensorDictBase, action: Tensor) -> Tensor:
@@ -284,7 +150,7 @@ class DIPOLoss(LossModule):
         Returns:
             refined action ``[*B, n, A]`` within the bounds of the actor, detached.
         """
-        if self.refine_steps == 0:
+        if self.refinement["steps"] == 0:
             return action.detach()
         with torch.no_grad():
             embedding = self._critic_embedding(tensordict)
@@ -294,74 +160,5 @@ class DIPOLoss(LossModule):
             lambda candidate: self._qvalues(embedding, candidate, params).amin(0),
             self.actor_network.module.low,
             self.actor_network.module.high,
-            self.refine_steps,
-            self.refine_step_size,
-            self.refine_max_norm,
+            **self.refinement,
         )
-
-    def _embed(self, tensordict: TensorDictBase, name: str, target: bool = False) -> TensorDictBase:
-        """What a network reads: the encoder's output, or the observations where there is no encoder."""
-        if not self.has_encoder:
-            return tensordict
-        network = getattr(self, name)
-        params = getattr(self, f"target_{name}_params" if target else f"{name}_params")
-        with params.to_module(network, preserve_module_state=False):
-            return network(tensordict.select(*network.in_keys))
-
-    def _critic_embedding(self, tensordict: TensorDictBase, target: bool = False) -> TensorDictBase:
-        name = "critic_encoder_network" if self.separate_encoders else "encoder_network"
-        return self._embed(tensordict, name, target)
-
-    def _sample_action(self, embedding: TensorDictBase, params: TensorDictParams) -> Tensor:
-        with (
-            set_exploration_type(self.deterministic_sampling_mode),
-            params.to_module(self.actor_network, preserve_module_state=False),
-        ):
-            sampled = self.actor_network(embedding.select(*self.actor_network.in_keys))
-        return sampled[self.actor_network.out_keys[0]]
-
-    def _qvalues(self, embedding: TensorDictBase, action: Tensor, params: TensorDictBase) -> Tensor:
-        """Values of all critics: ``[critics, *B, n, 1]``."""
-        inputs = embedding.select(*self.qvalue_network.in_keys, strict=False)
-        inputs[self.tensor_keys.action] = action
-        return self._vmap_qvalue(inputs, params)[self.tensor_keys.state_action_value]
-
-    @torch.no_grad()
-    def _target_value(self, tensordict: TensorDictBase) -> tuple[Tensor, Tensor]:
-        """TD target and the value of the next state, ``[*B, n, 1]`` both."""
-        keys, following = self.tensor_keys, tensordict["next"]
-        actor_view = self._embed(following, "encoder_network", target=True)
-        action = self._sample_action(actor_view, self.target_actor_network_params)
-        critic_view = self._critic_embedding(following, target=True) if self.separate_encoders else actor_view
-        next_value = self._qvalues(critic_view, action, self.target_qvalue_network_params).amin(0)
-        reward = _per_robot(following[keys.reward], next_value)
-        data = TensorDict(
-            {
-                "next": {
-                    "reward": reward,
-                    "done": _per_robot(following[keys.done], reward),
-                    "terminated": _per_robot(following[keys.terminated], reward),
-                }
-            },
-            tensordict.shape,
-        )
-        steps = tensordict.get(keys.steps_to_next_obs, None)
-        if steps is not None:
-            data["steps_to_next_obs"] = _per_robot(steps, reward)
-        return self.value_estimator.value_estimate(data, next_value=next_value), next_value
-
-    def _reduce(
-        self, loss: Tensor, tensordict: TensorDictBase, weights: Tensor | None, mask: Tensor | None = None
-    ) -> Tensor:
-        if weights is not None:
-            weights = weights.reshape(*tensordict.shape, *[1] * (loss.ndim - tensordict.ndim)).expand_as(loss)
-        return self._reduce_loss(loss, tensordict=tensordict, weights=weights, mask=mask)
-
-
-def _under_next(key: NestedKey) -> NestedKey:
-    return ("next", key) if isinstance(key, str) else ("next", *key)
-
-
-def _per_robot(value: Tensor, like: Tensor) -> Tensor:
-    """A team's number ``[*B, 1]`` for each of its robots ``[*B, n, 1]``; a robot's own is left as it is."""
-    return value if value.shape == like.shape else value.unsqueeze(-2).expand_as(like)
