@@ -165,7 +165,13 @@ class Config:
     sampling_steps: int = 5
     """Steps of the strided sampling chain."""
     noise_ratio: float = 0.0
-    """Noise added within the chain: 0 follows the posterior mean, 1 is Table 3's."""
+    """Noise added within the chain (ddpm): 0 follows the posterior mean, 1 is Table 3's."""
+    sampler: str = "ddpm"
+    """ddpm, ddim or dpmsolver."""
+    eta: float = 0.0
+    """Noise of ddim, from 0 to 1."""
+    best_of_n: int = 1
+    """Collect with the best of N sampled actions by min Q; 1: off. Evaluations are of the policy itself."""
 
     # evaluation
     evaluation_interval: int = 400
@@ -205,6 +211,7 @@ class Config:
         for name in (
             "num_trajectories", "clone_updates", "clone_batch", "num_envs", "collect_steps", "updates_per_step",
             "batch_size", "buffer_size", "evaluation_interval", "evaluation_starts", "num_starts", "hidden",
+            "best_of_n",
         ):  # fmt: skip
             if getattr(config, name) < 1:
                 raise ValueError(f"{name}: got {getattr(config, name)}, must be at least 1")

@@ -2,16 +2,23 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Callable
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Literal
 
 import tyro
-from tensordict.nn import TensorDictModuleBase
+from tensordict import TensorDictBase
+from tensordict.nn import TensorDictModuleBase, TensorDictSequential
+from torch import Tensor
+from torchrl.envs import TransformedEnv
+from torchrl.envs.utils import ExplorationType
 
+from redig.checkpoint import load_checkpoint
 from redig.envs.factory import make_env
 from redig.evaluation import evaluate, format_table, rollout_trajectories, write_metrics
-from redig.policy import load_policy, read_header
+from redig.modules import BestOfN
+from redig.policy import build_policy, build_sampler, load_policy, read_header
 from redig.viz import animate, plot_trajectories
 
 
@@ -33,6 +40,24 @@ class Arguments:
     """Another number of robots."""
     corridor_width: float | None = None
     """Another width of the corridor (m)."""
+    sampler: Literal["ddpm", "ddim", "dpmsolver"] | None = None
+    """Another sampler than the one that the policy was trained with."""
+    sampling_steps: int | None = None
+    """Steps of that sampler."""
+    eta: float | None = None
+    """Noise of ddim, from 0 to 1; has an effect with --stochastic only."""
+    noise_ratio: float | None = None
+    """Noise of ddpm, from 0 to 1; has an effect with --stochastic only."""
+    stochastic: bool = False
+    """Sample actions: a random latent and the sampler's noise at each step, instead of a zero latent and none."""
+    fixed_latent: bool = False
+    """One random latent for each robot and episode, instead of a zero latent."""
+    warm_start: int | None = None
+    """Begin each chain at this diffusion step, with the action before."""
+    best_of_n: int = 1
+    """Take the best of N sampled actions by min Q; 1: off. It is stated in all that is written."""
+    critics: Path | None = None
+    """The run whose critics choose among the N."""
     animation: bool = True
     """Draw the first start as a figure and as an animation."""
 
@@ -45,20 +70,66 @@ def main(arguments: Arguments) -> dict[str, float]:
     changes = {name: getattr(arguments, name) for name in ("formation", "n_robots", "corridor_width")}
     scenario |= {name: value for name, value in changes.items() if value is not None}
     env = make_env(arguments.starts, **scenario)
-    policy = load_policy(arguments.policy, env.observation_spec["agents", "observation"].shape[-1])
-    metrics = evaluate(policy, env, seed=arguments.seed)
+    policy = load(arguments, env.observation_spec["agents", "observation"].shape[-1])
+    driver: TensorDictModuleBase = policy
+    if arguments.best_of_n > 1:
+        if arguments.critics is None:
+            raise ValueError("critics: --best-of-n needs the run whose critics choose, --critics RUN")
+        driver = BestOfN(policy, load_critics(arguments.critics), arguments.best_of_n)
+        print(f"best of {arguments.best_of_n} actions by min Q, critics of {arguments.critics}: not the policy alone")
+    kind = ExplorationType.RANDOM if arguments.stochastic else ExplorationType.DETERMINISTIC
+    metrics = evaluate(driver, with_memory(env, policy), seed=arguments.seed, exploration_type=kind)
+    if arguments.best_of_n > 1:
+        metrics["best_of_n"] = arguments.best_of_n
     print(format_table(metrics))
     arguments.out.mkdir(parents=True, exist_ok=True)
     write_metrics(arguments.out / "metrics.json", metrics)
     if arguments.animation:
-        draw_crossing(arguments.out, policy, scenario, arguments.seed)
+        draw_crossing(arguments.out, driver, with_memory(make_env(1, **scenario), policy), arguments.seed)
     print(f"written to {arguments.out}")
     return metrics
 
 
-def draw_crossing(folder: Path, policy: TensorDictModuleBase, scenario: dict[str, Any], seed: int) -> None:
-    """One crossing as a figure and as an animation."""
-    env = make_env(1, **scenario)
+def load(arguments: Arguments, observation_dim: int) -> TensorDictSequential:
+    """The policy with the sampler and the options that the command line asks for."""
+    config, _ = read_header(arguments.policy)
+    given = {name: getattr(arguments, name) for name in ("sampler", "sampling_steps", "eta", "noise_ratio")}
+    config = replace(config, **{name: value for name, value in given.items() if value is not None})
+    sampler = build_sampler(config.sampler, config.sampling_steps, config.noise_ratio, config.early_stop, config.eta)
+    return load_policy(
+        arguments.policy,
+        observation_dim,
+        sampler=sampler,
+        fixed_latent=arguments.fixed_latent,
+        warm_start=arguments.warm_start,
+    )
+
+
+def with_memory(env: TransformedEnv, policy: TensorDictSequential) -> TransformedEnv:
+    """The environment, with what a policy with a fixed latent or a warm start keeps from step to step."""
+    actor = policy[-1]
+    if actor.latent_key is not None or actor.previous_action_key is not None:
+        env.append_transform(actor.make_tensordict_primer(env.full_action_spec_unbatched["agents", "action"].shape))
+    return env
+
+
+def load_critics(folder: Path) -> Callable[[TensorDictBase], Tensor]:
+    """Values of actions by the critics of a run, from its configuration and checkpoint."""
+    from redig_wedge import Config, make_loss, policy_architecture  # it imports this file for its final figures
+
+    checkpoint = folder / "checkpoint.pt"
+    if not checkpoint.is_file():
+        raise FileNotFoundError(f"critics: {folder} holds no run with a checkpoint ({checkpoint})")
+    config = Config(resume=folder).resolve()
+    width = make_env(1, **config.scenario()).observation_spec["agents", "observation"].shape[-1]
+    architecture = policy_architecture(config, width)
+    loss = make_loss(config, architecture, build_policy(architecture))
+    loss.load_state_dict(load_checkpoint(checkpoint)["loss"])
+    return loss.value
+
+
+def draw_crossing(folder: Path, policy: TensorDictModuleBase, env: TransformedEnv, seed: int) -> None:
+    """One crossing of the only team in ``env`` as a figure and as an animation."""
     rollout = rollout_trajectories(policy, env, seed)
     position = rollout["position"][0, rollout["mask"][0]]
     world = env.base_env.scenario

@@ -36,6 +36,8 @@ def finish(run: Run, config: Config) -> dict[str, float]:
     others = {f"{name}_{key}": value for name in ("cloned", "last") for key, value in results[name].items()}
     write_metrics(run.folder / "metrics.json", {**metrics, **others})
     plot_learning_curves(run.folder / "learning_curve.png", run.evaluations)
-    draw_crossing(run.folder, load_policy(run.folder / "policy.safetensors"), config.scenario(), TEST_SEED)
+    draw_crossing(
+        run.folder, load_policy(run.folder / "policy.safetensors"), make_env(1, **config.scenario()), TEST_SEED
+    )
     print(f"\neverything is in {run.folder} ({platform.machine()}, {torch.get_num_threads()} threads)")
     return metrics

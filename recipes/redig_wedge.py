@@ -26,7 +26,7 @@ from torchrl.objectives import SoftUpdate
 from redig.checkpoint import collection_state, set_collection_state
 from redig.envs.factory import make_env
 from redig.evaluation import evaluate
-from redig.modules import QNetwork
+from redig.modules import BestOfN, QNetwork
 from redig.objectives import DIPOLoss, MultiStep
 from redig.planning import demonstrations
 from redig.policy import ACTION, EMBEDDING, OBSERVATION, PolicyConfig, build_encoder, build_policy, save_policy
@@ -68,9 +68,10 @@ def train(config: Config) -> dict[str, float]:
     env.set_seed(config.seed)  # VMAS has one random state for all environments: seed after the last is built
     noise = AdditiveGaussianModule(env.action_spec, config.warmup_noise, config.warmup_noise, action_key=ACTION)
     keep_base = TensorDictModule(torch.clone, in_keys=[ACTION], out_keys=[BASE_ACTION])
+    behaviour = BestOfN(policy, loss.value, config.best_of_n) if config.best_of_n > 1 else policy
     collector = Collector(
         env,
-        TensorDictSequential(*policy, keep_base, noise),
+        TensorDictSequential(behaviour, keep_base, noise),
         frames_per_batch=config.num_envs * config.collect_steps,
         total_frames=-1,
         postproc=multi_step,
@@ -140,6 +141,8 @@ def train(config: Config) -> dict[str, float]:
             # Lines 11, 6, 7 and 12: refine its actions, the diffusion loss on them (Eq. 1), a step of psi and phi
             if update % 2:
                 update_actor(batch(max(share / 2, config.final_share)))
+        if config.best_of_n > 1:
+            run.figures["best_of_n"] = config.best_of_n
         run.figures["frames/s"] = config.num_envs * config.collect_steps / (time.perf_counter() - started)
         run.log(run.figures, i + 1, "train/")
         if (i + 1) % interval == 0 or i + 1 == rounds:
@@ -177,6 +180,8 @@ def policy_architecture(config: Config, observation_dim: int) -> PolicyConfig:
         schedule=config.schedule,
         sampling_steps=config.sampling_steps,
         noise_ratio=config.noise_ratio,
+        sampler=config.sampler,
+        eta=config.eta,
     )
 
 

@@ -11,7 +11,8 @@ from safetensors.torch import save_file
 from tensordict import TensorDict
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 
-from redig.modules import DDPM
+from redig.envs import make_env
+from redig.modules import DDIM, DDPM, DPMSolver
 from redig.policy import ACTION, FORMAT, OBSERVATION, PolicyConfig, build_policy, load_policy, read_header, save_policy
 
 SMALL = PolicyConfig(9, embedding_dim=6, encoder_hidden=6, hidden=(8,), diffusion_steps=10, sampling_steps=5)
@@ -201,3 +202,38 @@ def test_missing_file(tmp_path):
 def test_sampler_that_does_not_fit_the_schedule():
     with pytest.raises(ValueError, match="asks for 11 steps, the schedule has 10"):
         build_policy(replace(SMALL, sampling_steps=11))
+
+
+def test_deployment_chooses_the_sampler(tmp_path):
+    config = PolicyConfig(observation_dim=9, diffusion_steps=20, sampling_steps=5, sampler="ddim", eta=0.5)
+    policy = build_policy(config)
+    assert policy[-1].module.sampler == DDIM(5, 0.5)
+    path = tmp_path / "policy.safetensors"
+    save_policy(path, policy, config)
+    assert load_policy(path)[-1].module.sampler == DDIM(5, 0.5)
+    other = load_policy(path, sampler=DPMSolver(4))
+    assert other[-1].module.sampler == DPMSolver(4)
+    for name, weight in policy.state_dict().items():
+        assert torch.equal(other.state_dict()[name], weight), name
+    with pytest.raises(ValueError, match="asks for 21 steps, the schedule has 20"):
+        load_policy(path, sampler=DDIM(21))
+
+
+def test_unknown_sampler():
+    with pytest.raises(ValueError, match="sampler: got 'euler', allowed are ddpm, ddim, dpmsolver"):
+        build_policy(PolicyConfig(observation_dim=9, sampler="euler"))
+
+
+def test_deployment_keeps_latent_and_previous_action(tmp_path):
+    config = PolicyConfig(observation_dim=9, diffusion_steps=20)
+    path = tmp_path / "policy.safetensors"
+    save_policy(path, build_policy(config), config)
+    policy = load_policy(path, fixed_latent=True, warm_start=7)
+    env = make_env(3, max_steps=4)
+    shape = env.full_action_spec_unbatched["agents", "action"].shape
+    data = env.append_transform(policy[-1].make_tensordict_primer(shape)).rollout(4, policy)
+    latent, previous = data["agents", "latent"], data["agents", "previous_action"]
+    assert torch.equal(latent, latent[:, :1].expand_as(latent))
+    assert latent[:, 0].std() > 0.3
+    assert torch.equal(previous[:, 0], torch.zeros_like(previous[:, 0]))
+    torch.testing.assert_close(previous[:, 1:], data["agents", "action"][:, :-1])  # bounds of -1 and 1 m/s

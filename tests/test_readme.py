@@ -1,20 +1,22 @@
 import re
 from pathlib import Path
 
+import pytest
 import torch
 
-README = (Path(__file__).parents[1] / "README.md").read_text()
+README = Path(__file__).parents[1] / "README.md"
 
 
-def example():
-    (code,) = re.findall(r"```python\n(.*?)```", README, re.DOTALL)
+@pytest.fixture
+def example(python_blocks):
+    (code,) = python_blocks(README)
     return code
 
 
-def test_the_composition_example_runs_and_trains_every_network():
+def test_the_composition_example_runs_and_trains_every_network(example):
     torch.manual_seed(0)
     names = {}
-    exec(example(), names)
+    exec(example, names)
     assert torch.isfinite(names["losses"]["loss_qvalue"]) and torch.isfinite(names["losses"]["loss_actor"])
     assert len(names["buffer"]) == 1600
     for network in ("encoder_network", "actor_network", "qvalue_network"):
@@ -23,12 +25,11 @@ def test_the_composition_example_runs_and_trains_every_network():
         assert any(not torch.equal(learned[key], target[key]) for key in learned.keys()), network  # noqa: SIM118
 
 
-def test_the_composition_example_is_short():
-    lines = [line for line in example().splitlines() if line and not line.startswith(("from ", "import "))]
+def test_the_composition_example_is_short(example):
+    lines = [line for line in example.splitlines() if line and not line.startswith(("from ", "import "))]
     assert len(lines) <= 25
 
 
 def test_files_that_the_readme_links_exist():
-    root = Path(__file__).parents[1]
-    for target in re.findall(r"\]\(([^)#:]+)\)", README):
-        assert (root / target).exists(), target
+    for target in re.findall(r"\]\(([^)#:]+)\)", README.read_text()):
+        assert (README.parent / target).exists(), target

@@ -14,10 +14,12 @@ from tensordict.nn import TensorDictModule, TensorDictSequential
 from torchrl.data import Bounded
 
 from redig.files import replacing
-from redig.modules import DDPM, DenoisingMLP, DiffusionActor, GraphEncoder, NoiseSchedule
+from redig.modules import DDIM, DDPM, DenoisingMLP, DiffusionActor, DPMSolver, GraphEncoder, NoiseSchedule, Sampler
 
 FORMAT = "redig-policy-1"
 OBSERVATION, EMBEDDING, ACTION = ("agents", "observation"), ("agents", "embedding"), ("agents", "action")
+LATENT = ("agents", "latent")
+SAMPLERS = ("ddpm", "ddim", "dpmsolver")
 
 
 @dataclass(frozen=True)
@@ -31,7 +33,12 @@ class PolicyConfig:
             :class:`~redig.modules.GraphEncoder`.
         hidden, step_dim: see :class:`~redig.modules.DenoisingMLP`.
         diffusion_steps, schedule: see :class:`~redig.modules.NoiseSchedule`.
-        sampling_steps, noise_ratio, early_stop: see :class:`~redig.modules.DDPM`.
+        sampling_steps, noise_ratio, early_stop, sampler, eta: see :func:`build_sampler`.
+
+    Examples:
+        >>> config = PolicyConfig(observation_dim=9, sampling_steps=5)
+        >>> config.diffusion_steps, config.radius  # trained with 100 steps, sampled with 5; robots hear 2 m far
+        (100, 2.0)
     """
 
     observation_dim: int
@@ -50,10 +57,48 @@ class PolicyConfig:
     sampling_steps: int | None = None
     noise_ratio: float = 1.0
     early_stop: int | None = None
+    sampler: str = "ddpm"
+    eta: float = 0.0
+
+
+def build_sampler(
+    name: str,
+    num_steps: int | None = None,
+    noise_ratio: float = 1.0,
+    early_stop: int | None = None,
+    eta: float = 0.0,
+) -> Sampler:
+    """A sampler by its name: ``"ddpm"``, ``"ddim"`` or ``"dpmsolver"``.
+
+    Args:
+        name: which sampler.
+        num_steps: steps of the chain.
+        noise_ratio, early_stop: of :class:`~redig.modules.DDPM`.
+        eta: of :class:`~redig.modules.DDIM`.
+
+    Raises:
+        ValueError: for an unknown name, or options outside their range.
+
+    Examples:
+        >>> build_sampler("ddim", num_steps=5)
+        DDIM(num_steps=5, eta=0.0)
+    """
+    if name not in SAMPLERS:
+        raise ValueError(f"sampler: got {name!r}, allowed are {', '.join(SAMPLERS)}")
+    if name == "ddpm":
+        return DDPM(num_steps, noise_ratio, early_stop)
+    return DDIM(num_steps, eta) if name == "ddim" else DPMSolver(num_steps)
 
 
 def build_encoder(config: PolicyConfig) -> TensorDictModule:
-    """A graph encoder from robots' observations to their embeddings."""
+    """A graph encoder from robots' observations to their embeddings.
+
+    Examples:
+        >>> from tensordict import TensorDict
+        >>> encoder = build_encoder(PolicyConfig(observation_dim=9, embedding_dim=32))
+        >>> encoder(TensorDict({"agents": {"observation": torch.zeros(1, 5, 9)}}, [1]))["agents", "embedding"].shape
+        torch.Size([1, 5, 32])
+    """
     encoder = GraphEncoder(
         config.observation_dim,
         config.embedding_dim,
@@ -66,8 +111,16 @@ def build_encoder(config: PolicyConfig) -> TensorDictModule:
     return TensorDictModule(encoder, in_keys=[OBSERVATION], out_keys=[EMBEDDING])
 
 
-def build_policy(config: PolicyConfig) -> TensorDictSequential:
+def build_policy(
+    config: PolicyConfig, *, fixed_latent: bool = False, warm_start: int | None = None
+) -> TensorDictSequential:
     """A new policy with random weights: graph encoder, then diffusion actor.
+
+    Args:
+        config: the architecture.
+        fixed_latent: read each robot's latent from ``("agents", "latent")`` instead of drawing one at each step.
+        warm_start: step at which the chain begins with the action before, see :class:`~redig.modules.DiffusionActor`.
+            For either, append the actor's ``make_tensordict_primer()`` to the environment.
 
     Examples:
         >>> import torch
@@ -84,7 +137,11 @@ def build_policy(config: PolicyConfig) -> TensorDictSequential:
         in_keys=[EMBEDDING],
         out_keys=[ACTION],
         schedule=NoiseSchedule(config.diffusion_steps, config.schedule),
-        sampler=DDPM(config.sampling_steps, config.noise_ratio, config.early_stop),
+        sampler=build_sampler(
+            config.sampler, config.sampling_steps, config.noise_ratio, config.early_stop, config.eta
+        ),
+        latent_key=LATENT if fixed_latent else None,
+        warm_start=warm_start,
     )
     return TensorDictSequential(build_encoder(config), actor)
 
@@ -99,6 +156,15 @@ def save_policy(
         policy: as made by :func:`build_policy`.
         config: that made it.
         environment: arguments of the scenario that it was trained in, for those who evaluate it.
+
+    Examples:
+        >>> import tempfile
+        >>> config = PolicyConfig(observation_dim=9)
+        >>> with tempfile.TemporaryDirectory() as folder:
+        ...     save_policy(f"{folder}/policy.safetensors", build_policy(config), config, {"formation": "line"})
+        ...     found, environment = read_header(f"{folder}/policy.safetensors")
+        >>> found == config, environment
+        (True, {'formation': 'line'})
     """
     header = {"format": FORMAT, "policy": json.dumps(asdict(config)), "environment": json.dumps(environment or {})}
     weights = {key: value.detach().cpu().contiguous() for key, value in policy.state_dict().items()}
@@ -112,6 +178,12 @@ def read_header(path: str | Path) -> tuple[PolicyConfig, dict[str, Any]]:
     Raises:
         FileNotFoundError: if there is no such file.
         ValueError: if it is not a policy file.
+
+    Examples:
+        >>> read_header("no/such/policy.safetensors")
+        Traceback (most recent call last):
+        ...
+        FileNotFoundError: policy: no such file: no/such/policy.safetensors
     """
     path = Path(path)
     if not path.is_file():
@@ -131,16 +203,39 @@ def read_header(path: str | Path) -> tuple[PolicyConfig, dict[str, Any]]:
         raise ValueError(f"policy: the header of {path} is damaged, or of another version ({error})") from error
 
 
-def load_policy(path: str | Path, observation_dim: int | None = None) -> TensorDictSequential:
+def load_policy(
+    path: str | Path,
+    observation_dim: int | None = None,
+    *,
+    sampler: Sampler | None = None,
+    fixed_latent: bool = False,
+    warm_start: int | None = None,
+) -> TensorDictSequential:
     """A ready policy from its file: reads ``("agents", "observation")``, writes ``("agents", "action")``.
 
     Args:
         path: of the file.
         observation_dim: width of the observations that it will be given, to be checked at once.
+        sampler: in place of the one that it was trained with.
+        fixed_latent, warm_start: see :func:`build_policy`.
 
     Raises:
         FileNotFoundError: if there is no such file.
         ValueError: if it is not a policy file, is damaged, or was trained on another observation width.
+
+    Examples:
+        >>> import tempfile
+        >>> from tensordict import TensorDict
+        >>> from torchrl.envs.utils import ExplorationType, set_exploration_type
+        >>> config = PolicyConfig(observation_dim=9, sampling_steps=5)
+        >>> policy = build_policy(config)
+        >>> with tempfile.TemporaryDirectory() as folder:
+        ...     save_policy(f"{folder}/policy.safetensors", policy, config)
+        ...     loaded = load_policy(f"{folder}/policy.safetensors", observation_dim=9)
+        >>> team = TensorDict({"agents": {"observation": torch.randn(1, 5, 9)}}, [1])
+        >>> with set_exploration_type(ExplorationType.DETERMINISTIC):
+        ...     torch.equal(loaded(team.clone())["agents", "action"], policy(team.clone())["agents", "action"])
+        True
     """
     config, _ = read_header(path)
     if observation_dim is not None and observation_dim != config.observation_dim:
@@ -148,7 +243,9 @@ def load_policy(path: str | Path, observation_dim: int | None = None) -> TensorD
             f"policy: {path} was trained on observations of {config.observation_dim} numbers a robot, the environment "
             f"gives {observation_dim}; build the environment with the same observe_direction"
         )
-    policy = build_policy(config)
+    policy = build_policy(config, fixed_latent=fixed_latent, warm_start=warm_start)
+    if sampler is not None:
+        policy = TensorDictSequential(policy[0], policy[1].with_sampler(sampler))
     try:
         policy.load_state_dict(load_file(path))
     except RuntimeError as error:

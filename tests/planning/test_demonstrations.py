@@ -134,6 +134,22 @@ def test_any_other_setting_makes_another_file(tmp_path, env, settings):
     assert len(list(tmp_path.iterdir())) == 2
 
 
+def test_a_scenario_with_a_formation_of_its_own_makes_another_file(tmp_path):
+    class Staggered(FormationNavigation):
+        def make_world(self, *args, **kwargs):
+            world = super().make_world(*args, **kwargs)
+            self.offsets = self.offsets + torch.tensor([[0.3, 0.0], [-0.3, 0.0], [0.0, 0.0]])
+            return world
+
+    class Renamed(FormationNavigation):
+        """Might override anything."""
+
+    for scenario in (FormationNavigation, Staggered, Renamed):
+        env = VmasEnv(scenario(), num_envs=2, formation="line", n_robots=3)
+        demonstrations(env, 6, max_steps=3, cache_dir=tmp_path)
+    assert len(list(tmp_path.iterdir())) == 3
+
+
 @pytest.mark.parametrize("damage", [b"", b"not a checkpoint", None])
 def test_a_corrupt_file_is_made_again(tmp_path, damage):
     first = demonstrations(make_env(2), 6, max_steps=3, cache_dir=tmp_path)

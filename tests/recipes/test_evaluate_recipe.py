@@ -43,3 +43,35 @@ def test_bad_input_is_named(tmp_path, smoke):
         evaluate.main(evaluate.Arguments(folder / "policy.safetensors", starts=0))
     with pytest.raises(ValueError, match="not a safetensors file"):
         evaluate.main(evaluate.Arguments(folder / "config.json"))
+
+
+@pytest.mark.parametrize(
+    "options",
+    [
+        {"sampler": "dpmsolver", "sampling_steps": 3},
+        {"sampler": "ddim", "eta": 0.5, "stochastic": True},
+        {"fixed_latent": True},
+        {"warm_start": 40, "stochastic": True, "noise_ratio": 1.0},
+    ],
+    ids=str,
+)
+def test_sampling_options(options, tmp_path):
+    arguments = evaluate.Arguments(SHIPPED, starts=8, seed=78, out=tmp_path, animation=False, **options)
+    metrics = evaluate.main(arguments)
+    assert metrics["team_success_rate"] == 1.0
+    plain = evaluate.main(evaluate.Arguments(SHIPPED, starts=8, seed=78, out=tmp_path, animation=False))
+    assert metrics["jerk_mean"] != plain["jerk_mean"]
+    assert "best_of_n" not in plain
+
+
+def test_best_of_n_is_stated(smoke, tmp_path, capsys):
+    folder, _ = smoke
+    policy = folder / "policy.safetensors"
+    options = {"starts": 2, "out": tmp_path, "animation": False, "best_of_n": 3}
+    evaluate.main(evaluate.Arguments(policy, critics=folder, **options))
+    assert json.loads((tmp_path / "metrics.json").read_text())["best_of_n"] == 3
+    assert "best of 3 actions by min Q" in capsys.readouterr().out
+    with pytest.raises(ValueError, match="critics: --best-of-n needs the run"):
+        evaluate.main(evaluate.Arguments(policy, **options))
+    with pytest.raises(FileNotFoundError, match="critics: .* holds no run with a checkpoint"):
+        evaluate.main(evaluate.Arguments(policy, critics=tmp_path, **options))

@@ -16,6 +16,18 @@ class VelocityCommand(Dynamics):
     Args:
         dt: time step (s).
         max_speed: limit on the norm of the command (m/s).
+
+    Examples:
+        >>> import torch
+        >>> from vmas.simulator.core import Agent, World
+        >>> world = World(1, torch.device("cpu"), dt=0.1, drag=0.0)
+        >>> robot = Agent("agent_0", max_f=2.0, dynamics=VelocityCommand(dt=0.1, max_speed=1.0))
+        >>> world.add_agent(robot)
+        >>> robot.action.u = torch.tensor([[3.0, 4.0]])
+        >>> robot.dynamics.process_action()
+        >>> world.step()
+        >>> robot.state.vel  # a tenth of a second at 2 m/s²
+        tensor([[0.1200, 0.1600]])
     """
 
     def __init__(self, dt: float, max_speed: float) -> None:
@@ -90,6 +102,13 @@ def leave_walls(
 
     Returns:
         position and velocity after the contact, shapes as given.
+
+    Examples:
+        >>> import torch
+        >>> robot, velocity = torch.tensor([[0.75, 0.0]]), torch.tensor([[1.0, 0.5]])
+        >>> wall_ahead = torch.tensor([[1.0, 0.0]])
+        >>> leave_walls(robot, velocity, 0.5, distance=torch.tensor([0.25]), direction=wall_ahead)
+        (tensor([[0.5000, 0.0000]]), tensor([[0.0000, 0.5000]]))
     """
     inside = (radius - distance).clamp_min(0).unsqueeze(-1)
     inward = (velocity * direction).sum(-1, keepdim=True).clamp_min(0) * (inside > 0)

@@ -25,7 +25,7 @@ def formation_offsets(name: str, n: int, width: float = 2.0) -> Tensor:
             the last robot on the right.
 
     Returns:
-        offsets ``[n, 2]`` (m): forward, left.
+        offsets ``[n, 2]`` (m), forward and left.
 
     Raises:
         ValueError: if the name is unknown, ``n`` too small or ``width`` not positive.

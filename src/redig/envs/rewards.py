@@ -54,6 +54,14 @@ def spring_damper_bonus(
 
     Returns:
         reward ``[*B, n]``, at most 1.
+
+    Examples:
+        >>> import torch
+        >>> line = torch.tensor([[0.0, 0.0], [0.5, 0.0]])
+        >>> spring_damper_bonus(line, torch.zeros(2, 2), 2 * torch.ones(2, 2))  # 1.5 m from the desired distance
+        tensor([0., 0.])
+        >>> spring_damper_bonus(line, torch.zeros(2, 2), torch.ones(2, 2))
+        tensor([0.5000, 0.5000])
     """
     n = position.shape[-2]
     spring = 1 - (desired - pairwise_distances(position)).abs().clamp_max(clip) / clip
@@ -77,8 +85,16 @@ def best_lateral_scale(
         limits: smallest and largest scale.
 
     Returns:
-        scale ``[*B]`` and residual ``[*B, n]`` (m), measured after stretching the team back to full width: a formation
-        squeezed to a third must be kept three times as precisely across, as its proportions demand.
+        scale ``[*B]`` and residual ``[*B, n]`` (m), measured after stretching the team back to full width, so that a
+        formation squeezed to a third must be kept three times as precisely across, as its proportions demand.
+
+    Examples:
+        >>> import torch
+        >>> from redig.envs.formations import formation_offsets
+        >>> line = formation_offsets("line", 3)
+        >>> scale, residual = best_lateral_scale(0.5 * line, line, torch.tensor([1.0, 0.0]))
+        >>> scale.item(), residual.max().item()  # half as broad, and whole
+        (0.5, 0.0)
     """
     relative = position - position.mean(-2, keepdim=True)
     direction = direction.unsqueeze(-2)
@@ -127,7 +143,14 @@ def scaled_formation_bonus(
 
 
 def goal_speed(position: Tensor, velocity: Tensor, goal: Tensor) -> Tensor:
-    """The moving part of Eq. 30, ``q . r / |r| * |q|``: speed times its alignment with the goal. ``[*B, n]``."""
+    """The moving part of Eq. 30, ``q . r / |r| * |q|``: speed times its alignment with the goal. ``[*B, n]``.
+
+    Examples:
+        >>> import torch
+        >>> velocity = torch.tensor([[0.5, 0.0], [0.0, 0.5]])  # towards the goal, and across
+        >>> goal_speed(torch.zeros(2, 2), velocity, torch.tensor([3.0, 0.0]))
+        tensor([0.2500, 0.0000])
+    """
     to_goal = goal - position
     heading = to_goal / to_goal.norm(dim=-1, keepdim=True).clamp_min(1e-9)
     return (velocity * heading).sum(-1) * velocity.norm(dim=-1)
@@ -155,6 +178,12 @@ def clearance(position: Tensor, obstacle_distance: Tensor, radius: float) -> Ten
 
     Returns:
         ``[*B, n]`` (m); negative where robots overlap or stand inside a wall, which is a collision of either kind.
+
+    Examples:
+        >>> import torch
+        >>> position = torch.tensor([[0.0, 0.0], [1.0, 0.0]])
+        >>> clearance(position, torch.tensor([3.0, 0.5]), radius=0.25)  # the mate is nearer, the wall is nearer
+        tensor([0.5000, 0.2500])
     """
     n = position.shape[-2]
     myself = torch.eye(n, dtype=torch.bool, device=position.device)
@@ -163,5 +192,11 @@ def clearance(position: Tensor, obstacle_distance: Tensor, radius: float) -> Ten
 
 
 def proximity(clearance: Tensor, margin: float = 0.1) -> Tensor:
-    """Ramp that warns of a collision: 0 with ``margin`` (m) or more of free space, 1 at contact. ``[*B, n]``."""
+    """Ramp that warns of a collision: 0 with ``margin`` (m) or more of free space, 1 at contact. ``[*B, n]``.
+
+    Examples:
+        >>> import torch
+        >>> proximity(torch.tensor([1.0, 0.125, 0.0]), margin=0.25)
+        tensor([0.0000, 0.5000, 1.0000])
+    """
     return (1 - clearance / margin).clamp(0, 1)

@@ -41,6 +41,14 @@ def rollout_trajectories(
 
     Raises:
         ValueError: if there is no horizon, or it is not positive.
+
+    Examples:
+        >>> from tensordict.nn import TensorDictModule
+        >>> from redig.envs import make_env
+        >>> observation, action = ("agents", "observation"), ("agents", "action")
+        >>> rest = TensorDictModule(lambda state: torch.zeros_like(state[..., :2]), [observation], [action])
+        >>> rollout_trajectories(rest, make_env(2), seed=0, max_steps=3)["position"].shape
+        torch.Size([2, 4, 5, 2])
     """
     max_steps = _horizon(env) if max_steps is None else max_steps
     if max_steps < 1:
@@ -97,6 +105,15 @@ def evaluate(
 
     Raises:
         ValueError: if ``num_starts`` or ``max_steps`` is not positive, or there is no horizon.
+
+    Examples:
+        >>> from tensordict.nn import TensorDictModule
+        >>> from redig.envs import make_env
+        >>> observation, action = ("agents", "observation"), ("agents", "action")
+        >>> straight = TensorDictModule(lambda state: state[..., 4:6].clamp(-1, 1), [observation], [action])
+        >>> metrics = evaluate(straight, make_env(4, formation="line", corridor_width=4.0), seed=0)
+        >>> metrics["success_rate"], metrics["num_starts"]  # in so wide a corridor, straight on is good enough
+        (1.0, 4.0)
     """
     num_envs = env.batch_size[0]
     num_starts = num_envs if num_starts is None else num_starts

@@ -22,7 +22,7 @@ def success(arrived: Tensor, collision: Tensor) -> Tensor:
         collision: ``[*B, T, n]`` bool, whether the robot touches a wall or a teammate.
 
     Returns:
-        ``[*B, n]`` bool; its mean is the per-robot success rate, the mean of :func:`team_success` the per-team one.
+        ``[*B, n]`` bool. Its mean is the success rate of robots, that of :func:`team_success` the one of teams.
 
     Examples:
         >>> import torch
@@ -34,7 +34,14 @@ def success(arrived: Tensor, collision: Tensor) -> Tensor:
 
 
 def team_success(arrived: Tensor, collision: Tensor) -> Tensor:
-    """Which teams succeed, that is, all of their robots (see :func:`success`): ``[*B]`` bool."""
+    """Which teams succeed, that is, all of their robots (see :func:`success`): ``[*B]`` bool.
+
+    Examples:
+        >>> import torch
+        >>> arrived = torch.tensor([[[True, True]], [[True, False]]])  # two teams of two robots, one sample
+        >>> team_success(arrived, torch.zeros_like(arrived))
+        tensor([ True, False])
+    """
     return success(arrived, collision).all(-1)
 
 

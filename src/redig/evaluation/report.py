@@ -34,6 +34,13 @@ def write_metrics(path: str | Path, metrics: Mapping[str, float]) -> None:
     Args:
         path: of the file; its folder is made if it is missing.
         metrics: such as those of :func:`~redig.evaluation.evaluate.evaluate`.
+
+    Examples:
+        >>> import tempfile
+        >>> with tempfile.TemporaryDirectory() as folder:
+        ...     write_metrics(f"{folder}/metrics.json", {"success_rate": 0.0, "travel_time": math.nan})
+        ...     json.loads(Path(f"{folder}/metrics.json").read_text())
+        {'success_rate': 0.0, 'travel_time': None}
     """
     clean = {key: None if math.isnan(value) else value for key, value in metrics.items()}
     with replacing(path) as file:

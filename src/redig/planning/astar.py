@@ -22,6 +22,13 @@ def shortest_cells(grid: OccupancyGrid, start: int, goal: int) -> tuple[list[int
 
     Returns:
         cell numbers, and the length of the way (cells); no cells and infinity if there is none.
+
+    Examples:
+        >>> import torch
+        >>> grid = OccupancyGrid(torch.zeros(1, 4, dtype=torch.bool), resolution=1.0, origin=(0.0, 0.0))
+        >>> cells, length = shortest_cells(grid, grid.cell((0.5, 0.5)), grid.cell((3.5, 0.5)))
+        >>> [grid.centre(cell)[0] for cell in cells], length
+        ([0.5, 1.5, 2.5, 3.5], 3.0)
     """
     stride, neighbours = grid.stride, grid.neighbours
     goal_column, goal_row = divmod(goal, stride)

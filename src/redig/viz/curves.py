@@ -36,6 +36,14 @@ def plot_learning_curves(path: str | os.PathLike, *runs: Sequence[Row]) -> None:
     Raises:
         ValueError: if a run has no rows, runs differ in their updates, or the suffix is not one of those allowed.
         KeyError: if a row lacks a key.
+
+    Examples:
+        >>> import tempfile
+        >>> row = {"success_rate": 0.5, "team_success_rate": 0.25, "travel_time": 9.0, "cfi_0.5": 0.7, "jerk_mean": 1.0}
+        >>> with tempfile.TemporaryDirectory() as folder:
+        ...     plot_learning_curves(f"{folder}/curve.svg", [{"updates": 0, **row}, {"updates": 100, **row}])
+        ...     os.listdir(folder)
+        ['curve.svg']
     """
     path = check_suffix(path, IMAGE_SUFFIXES)
     if not runs or not all(runs):

@@ -23,7 +23,12 @@ VIDEO_SUFFIXES = (".gif", ".mp4")
 
 
 def robot_style(robot: int) -> tuple[str, str]:
-    """Colour and line style of a robot; where the colours repeat, the next line style begins."""
+    """Colour and line style of a robot; where the colours repeat, the next line style begins.
+
+    Examples:
+        >>> robot_style(0), robot_style(6)
+        (('#0072B2', '-'), ('#0072B2', '--'))
+    """
     return PALETTE[robot % len(PALETTE)], ("-", "--", ":")[robot // len(PALETTE) % 3]
 
 
@@ -45,6 +50,11 @@ def check_trajectory(position: Tensor, goal: Tensor | None) -> tuple[NDArray, ND
 
     Raises:
         ValueError: if a shape is wrong.
+
+    Examples:
+        >>> track, goals = check_trajectory(torch.zeros(7, 5, 2), goal=None)
+        >>> track.shape, goals
+        ((7, 5, 2), None)
     """
     position = torch.as_tensor(position).detach().cpu()
     if position.ndim != 3 or 0 in position.shape or position.shape[-1] != 2:
@@ -58,7 +68,12 @@ def check_trajectory(position: Tensor, goal: Tensor | None) -> tuple[NDArray, ND
 
 
 def view(position: NDArray, goal: NDArray | None, margin: float = 0.5) -> tuple[float, float, float, float]:
-    """Region ``(x_min, x_max, y_min, y_max)`` (m) around the motion and the goals, never very long and thin."""
+    """Region ``(x_min, x_max, y_min, y_max)`` (m) around the motion and the goals, never very long and thin.
+
+    Examples:
+        >>> view(np.array([[[0.0, 0.0]], [[5.0, 0.0]]]), goal=None)  # one robot, two samples
+        (-0.5, 5.5, -1.0, 1.0)
+    """
     points = position.reshape(-1, 2) if goal is None else np.concatenate([position.reshape(-1, 2), goal])
     low, high = points.min(0), points.max(0)
     half = (high - low) / 2 + margin
@@ -69,7 +84,16 @@ def view(position: NDArray, goal: NDArray | None, margin: float = 0.5) -> tuple[
 
 
 def draw_map(axes: Axes, obstacle_map: ObstacleMap, region: tuple[float, float, float, float]) -> None:
-    """Fill the obstacles and set up axes in metres that show ``region``."""
+    """Fill the obstacles and set up axes in metres that show ``region``.
+
+    Examples:
+        >>> from matplotlib.figure import Figure
+        >>> from redig.envs import corridor
+        >>> axes = Figure().add_subplot()
+        >>> draw_map(axes, corridor(), region=(-3.0, 3.0, -2.0, 2.0))
+        >>> len(axes.patches)  # a wall on either side
+        2
+    """
     quarter = np.linspace(0, np.pi / 2, 17)
     turn = np.concatenate([quarter + k * np.pi / 2 for k in range(4)])
     corner = np.repeat([[1, 1], [-1, 1], [-1, -1], [1, -1]], len(quarter), axis=0)
@@ -87,6 +111,10 @@ def check_suffix(path: str | os.PathLike, allowed: tuple[str, ...]) -> Path:
 
     Raises:
         ValueError: if it is not.
+
+    Examples:
+        >>> check_suffix("curve.png", (".png", ".pdf")).name
+        'curve.png'
     """
     path = Path(path)
     if path.suffix.lower() not in allowed:

@@ -51,6 +51,16 @@ def plot_trajectories(
 
     Raises:
         ValueError: if the suffix, a shape or the name is not one of those allowed.
+
+    Examples:
+        >>> import tempfile
+        >>> import torch
+        >>> from redig.envs import corridor, formation_offsets
+        >>> position = formation_offsets("wedge", 5) + torch.tensor([[-2.0, 0.0], [-1.0, 0.0]])[:, None]  # two samples
+        >>> with tempfile.TemporaryDirectory() as folder:
+        ...     plot_trajectories(f"{folder}/crossing.svg", position, "wedge", corridor())
+        ...     os.listdir(folder)
+        ['crossing.svg']
     """
     path = check_suffix(path, IMAGE_SUFFIXES)
     track, goals = check_trajectory(position, goal)
