@@ -107,10 +107,8 @@ def load(arguments: Arguments, observation_dim: int) -> TensorDictSequential:
 
 def with_memory(env: TransformedEnv, policy: TensorDictSequential) -> TransformedEnv:
     """The environment, with what a policy with a fixed latent or a warm start keeps from step to step."""
-    actor = policy[-1]
-    if actor.latent_key is not None or actor.previous_action_key is not None:
-        env.append_transform(actor.make_tensordict_primer(env.full_action_spec_unbatched["agents", "action"].shape))
-    return env
+    shape = env.full_action_spec_unbatched["agents", "action"].shape
+    return env.append_transform(policy[-1].make_tensordict_primer(shape))
 
 
 def load_critics(folder: Path) -> Callable[[TensorDictBase], Tensor]:

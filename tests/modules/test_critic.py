@@ -51,3 +51,27 @@ def test_gradient_reaches_inputs_and_all_weights():
 def test_unknown_activation():
     with pytest.raises(ValueError, match="activation: got 'gelu'"):
         QNetwork(6, 2, activation="gelu")
+
+
+@pytest.mark.parametrize("dtype", [torch.float64, torch.bfloat16])
+def test_inputs_are_cast_to_the_networks_type(dtype):
+    critic = QNetwork(6, 2, hidden=(16,)).to(dtype)
+    embedding, action = torch.randn(5, 6), torch.randn(5, 2, requires_grad=True)
+    value = critic(embedding, action)
+    assert value.dtype == dtype
+    torch.testing.assert_close(value, critic(embedding.to(dtype), action.to(dtype)))
+    value.sum().backward()
+    assert action.grad.dtype == torch.float32  # as refinement of actions needs it
+
+
+@pytest.mark.parametrize(
+    ("embedding", "action", "message"),
+    [
+        ((8, 5, 6), (8, 5, 3), r"action: got shape \[8, 5, 3\], expected \[\*B, 2\]"),
+        ((8, 4, 6), (8, 5, 2), r"embedding: got shape \[8, 4, 6\], expected \[8, 5, 6\]"),
+        ((8, 5, 7), (8, 5, 2), r"embedding: got shape \[8, 5, 7\], expected \[8, 5, 6\]"),
+    ],
+)
+def test_shapes_that_do_not_fit(embedding, action, message):
+    with pytest.raises(ValueError, match=message):
+        QNetwork(6, 2)(torch.zeros(embedding), torch.zeros(action))

@@ -86,3 +86,35 @@ def test_bad_step_dim(step_dim):
 def test_unknown_activation():
     with pytest.raises(ValueError, match="activation: got 'gelu', allowed are mish, relu, silu, tanh"):
         DenoisingMLP(2, 6, activation="gelu")
+
+
+@pytest.mark.parametrize("dtype", [torch.float64, torch.bfloat16, torch.float16])
+def test_inputs_are_cast_to_the_networks_type(dtype):
+    denoiser = DenoisingMLP(2, 6, hidden=(16,))
+    action, step, embedding = torch.randn(5, 2), torch.tensor([0, 500, 501, 998, 999]), torch.randn(5, 6)
+    expected = denoiser(action, step, embedding)
+    found = denoiser.to(dtype)(action, step, embedding)
+    assert found.dtype == dtype
+    torch.testing.assert_close(found.float(), expected, atol=0.02, rtol=0.02)
+
+
+def test_half_precision_tells_high_steps_apart():
+    """bfloat16 itself counts 998 and 999 as one; their embeddings must differ."""
+    denoiser = DenoisingMLP(2, 6, hidden=(16,)).bfloat16()
+    action, embedding = torch.zeros(2, 2), torch.zeros(2, 6)
+    first, second = denoiser(action, torch.tensor([998, 999]), embedding)
+    assert not torch.equal(first, second)
+
+
+@pytest.mark.parametrize(
+    ("action", "step", "embedding", "message"),
+    [
+        ((8, 5, 3), (8, 5), (8, 5, 6), r"action: got shape \[8, 5, 3\], expected \[\*B, 2\]"),
+        ((8, 5, 2), (8, 5), (8, 4, 6), r"embedding: got shape \[8, 4, 6\], expected \[8, 5, 6\]"),
+        ((8, 5, 2), (8,), (8, 5, 6), r"step: got shape \[8\], expected \[8, 5\], one for each action, or a scalar"),
+        ((8, 5, 2), (8, 5, 1), (8, 5, 6), r"step: got shape \[8, 5, 1\], expected \[8, 5\]"),
+    ],
+)
+def test_shapes_that_do_not_fit(action, step, embedding, message):
+    with pytest.raises(ValueError, match=message):
+        DenoisingMLP(2, 6)(torch.zeros(action), torch.zeros(step), torch.zeros(embedding))

@@ -141,3 +141,71 @@ def test_bad_arguments():
         NoiseSchedule(0)
     with pytest.raises(ValueError, match="'sigmoid', allowed are cosine, linear, vp"):
         NoiseSchedule(10, "sigmoid")
+
+
+def test_negative_steps_and_steps_beyond_the_last():
+    for step in (-2, 10):
+        with pytest.raises(ValueError, match=f"step: got {step}, need -1 <= step < 10"):
+            NoiseSchedule(10).signal(step)
+    with pytest.raises(ValueError, match="num_steps: got -3, must be at least 1"):
+        NoiseSchedule(-3)
+
+
+@pytest.mark.parametrize(
+    ("noise", "step"), [((3, 5, 2), (3,)), ((3, 5, 2), (3, 5, 1)), ((5, 2), (3, 5)), ((3, 5, 1), (3, 5))]
+)
+def test_shapes_that_do_not_fit(noise, step):
+    with pytest.raises(ValueError, match=r"step: got shape .* for actions \[3, 5, 2\] and noise .*, expected \[3, 5\]"):
+        NoiseSchedule(10).add_noise(torch.zeros(3, 5, 2), torch.zeros(noise), torch.zeros(step, dtype=torch.long))
+
+
+@pytest.mark.parametrize("dtype", [torch.float16, torch.bfloat16])
+def test_variances_stay_in_float32_in_a_module_of_half_precision(dtype):
+    schedule = NoiseSchedule(1000, "cosine")
+    module = torch.nn.Sequential(torch.nn.Linear(2, 2), schedule)
+    for moved in (module.to(dtype), module.float().to(device="cpu", dtype=dtype)):
+        assert moved[0].weight.dtype == dtype
+        for buffer in moved[1].buffers():
+            assert buffer.dtype == torch.float32
+        assert torch.equal(moved[1].alphas_cumprod, NoiseSchedule(1000, "cosine").alphas_cumprod)
+    action, noise = torch.randn(2, 1000, 2)
+    noisy = schedule.add_noise(action.to(dtype), noise.to(dtype), torch.arange(1000))
+    assert noisy.dtype == torch.float32
+    torch.testing.assert_close(noisy, schedule.add_noise(action, noise, torch.arange(1000)), atol=0.03, rtol=0.03)
+
+
+def test_double_precision_and_other_devices_are_followed():
+    schedule = NoiseSchedule(10)
+    assert schedule.double().alphas_cumprod.dtype == torch.float64
+    assert schedule.to("meta").betas.device.type == "meta"
+
+
+@pytest.mark.parametrize("kind", SCHEDULES)
+def test_state_dict_round_trip(kind):
+    schedule = NoiseSchedule(50, kind)
+    state = schedule.state_dict()
+    assert sorted(state) == ["alphas_cumprod", "betas"]
+    loaded = NoiseSchedule(50, kind)
+    loaded.load_state_dict(
+        {key: value.bfloat16() for key, value in state.items()}
+    )  # as in a policy saved to save space
+    torch.testing.assert_close(loaded.alphas_cumprod, schedule.alphas_cumprod, rtol=5e-3, atol=0)
+    loaded.load_state_dict(state)
+    assert torch.equal(loaded.alphas_cumprod, schedule.alphas_cumprod)
+
+
+@pytest.mark.parametrize("other", [NoiseSchedule(50, "vp"), NoiseSchedule(49, "cosine"), NoiseSchedule(1, "cosine")])
+def test_weights_of_another_schedule(other):
+    schedule = NoiseSchedule(50, "cosine")
+    before = schedule.alphas_cumprod.clone()
+    with pytest.raises(ValueError, match="weights are of another schedule than 'cosine' of 50 steps"):
+        torch.nn.ModuleDict({"schedule": schedule}).load_state_dict(
+            torch.nn.ModuleDict({"schedule": other}).state_dict()
+        )
+    assert torch.equal(schedule.alphas_cumprod, before)
+
+
+def test_weights_saved_in_float16_where_the_schedule_underflows():
+    schedule = NoiseSchedule(1000, "cosine")
+    with pytest.raises(ValueError, match="float16"):
+        schedule.load_state_dict({key: value.half() for key, value in schedule.state_dict().items()})

@@ -1,6 +1,7 @@
 """Networks and policies: tensors or TensorDicts in, the same out."""
 
 from redig.modules.actor import DiffusionActor
+from redig.modules.best_of import BestOfN
 from redig.modules.critic import QNetwork
 from redig.modules.denoiser import DenoisingMLP
 from redig.modules.encoder import GraphEncoder, radius_adjacency
@@ -10,6 +11,7 @@ from redig.modules.schedule import NoiseSchedule
 __all__ = [
     "DDIM",
     "DDPM",
+    "BestOfN",
     "DPMSolver",
     "DenoisingMLP",
     "DiffusionActor",

@@ -1,4 +1,4 @@
-"""Best of N: draw several actions and take the one that the critics value most. It is not the policy any more; say so."""
+"""Best of N: draw several actions and take the one that the critics value most."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ class BestOfN(TensorDictModuleBase):
     Args:
         policy: TensorDictModule that writes the action, such as encoder and :class:`~redig.modules.DiffusionActor`.
         value: values of the actions in a TensorDict, ``[*B, n, 1]`` or ``[*B, 1]``, such as
-            :meth:`DIPOLoss.value <redig.objectives.DiffusionActorCriticLoss.value>`, the minimum over the critics.
+            ``value`` of :class:`~redig.objectives.DIPOLoss`, the minimum over the critics.
         num_candidates: N; 1 is the policy itself, sampled.
         action_key: key of the action.
 

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor, nn
 
-from redig.modules.denoiser import check_shapes, mlp
+from redig.modules.denoiser import check_shapes, mlp, weight_dtype
 
 
 class QNetwork(nn.Module):
@@ -40,10 +40,11 @@ class QNetwork(nn.Module):
         self.net = mlp(embedding_dim + action_dim, hidden, 1, activation, layer_norm)
 
     def forward(self, embedding: Tensor, action: Tensor) -> Tensor:
-        """Value ``[*B, 1]`` of actions ``[*B, A]`` given embeddings ``[*B, H]``.
+        """Value ``[*B, 1]`` of actions ``[*B, A]`` given embeddings ``[*B, H]``, both cast to the network's type.
 
         Raises:
             ValueError: if the shapes do not fit each other or the network.
         """
         check_shapes(action, self.action_dim, embedding, self.embedding_dim)
-        return self.net(torch.cat([embedding, action], -1))
+        dtype = weight_dtype(self.net)
+        return self.net(torch.cat([embedding.to(dtype), action.to(dtype)], -1))

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from typing import cast
 
 import torch
 from torch import Tensor, nn
@@ -37,6 +38,16 @@ def mlp(
         layers.append(ACTIVATIONS[activation]())
         in_features = width
     return nn.Sequential(*layers, nn.Linear(in_features, out_features))
+
+
+def weight_dtype(net: nn.Sequential) -> torch.dtype:
+    """Type of the first layer's weight, also where ``parameters()`` is empty because TorchRL made them functional.
+
+    Examples:
+        >>> weight_dtype(mlp(3, (8,), 1).double())
+        torch.float64
+    """
+    return cast(Tensor, net[0].weight).dtype
 
 
 def sinusoidal_embedding(step: Tensor, dim: int, max_period: float = 10_000.0) -> Tensor:
@@ -109,7 +120,7 @@ class DenoisingMLP(nn.Module):
         self.net = mlp(action_dim + step_dim + embedding_dim, hidden, action_dim, activation)
 
     def forward(self, action: Tensor, step: Tensor, embedding: Tensor) -> Tensor:
-        """Predict the noise.
+        """Predict the noise. All inputs are cast to the network's type.
 
         Args:
             action: noisy action ``[*B, A]``.
@@ -123,6 +134,10 @@ class DenoisingMLP(nn.Module):
             ValueError: if the shapes do not fit each other or the network.
         """
         check_shapes(action, self.action_dim, embedding, self.embedding_dim)
-        time = sinusoidal_embedding(step.float(), self.step_dim).to(action.dtype)  # half types merge high steps
+        if step.ndim > 0 and step.shape != action.shape[:-1]:
+            expected = f"{list(action.shape[:-1])}, one for each action, or a scalar"
+            raise ValueError(f"step: got shape {list(step.shape)}, expected {expected}")
+        dtype = weight_dtype(self.net)
+        time = sinusoidal_embedding(step.float(), self.step_dim).to(dtype)  # half types would merge high steps
         time = time.expand(*action.shape[:-1], self.step_dim)
-        return self.net(torch.cat([action, time, embedding], -1))
+        return self.net(torch.cat([action.to(dtype), time, embedding.to(dtype)], -1))

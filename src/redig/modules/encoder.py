@@ -15,14 +15,26 @@ AGGREGATIONS = ("max", "sum", "mean")
 def radius_adjacency(position: Tensor, radius: float) -> Tensor:
     """Which robots hear each other, without self-loops: ``[*B, n, 2]`` (m) to a boolean ``[*B, n, n]``.
 
+    Distances are taken in float32 or better.
+
+    Raises:
+        ValueError: if ``position`` has another rank.
+
     Examples:
         >>> import torch
         >>> radius_adjacency(torch.tensor([[0.0, 0.0], [1.0, 0.0], [9.0, 0.0]]), 2.0).sum().item()
         2
     """
+    if position.ndim < 2:
+        raise ValueError(f"position: got shape {list(position.shape)}, expected [*B, n, 2]")
+    position = _at_least_float32(position)
     # the matrix product that cdist prefers for many points loses digits far from the origin
     near = torch.cdist(position, position, compute_mode="donot_use_mm_for_euclid_dist") <= radius
     return near & ~torch.eye(position.shape[-2], dtype=torch.bool, device=position.device)
+
+
+def _at_least_float32(position: Tensor) -> Tensor:
+    return position.to(torch.promote_types(position.dtype, torch.float32))
 
 
 class _EdgeMessages(MessagePassing):
@@ -57,6 +69,7 @@ class GraphEncoder(nn.Module):
     printed).
 
     Works for any number of robots; one without neighbours gets an aggregate of zero. Equivariant under permutations.
+    States are cast to the type of the network; positions are not, so that bfloat16 weights do not blur distances.
 
     Args:
         in_features: width of a robot's state (7 in the paper, 9 with the direction to the nearest obstacle).
@@ -118,7 +131,7 @@ class GraphEncoder(nn.Module):
         """Message from neighbour j to robot i: ``[..., H]`` from their states and ``p_j - p_i`` (m)."""
         if self.kind == "linear":
             return self.out(z_j - z_i)
-        edge = torch.cat([offset, offset.norm(dim=-1, keepdim=True)], -1)
+        edge = torch.cat([offset, offset.norm(dim=-1, keepdim=True)], -1).to(z_i.dtype)
         return self.message_out(
             self.act(self.message_self(z_i) + self.message_mate(z_j - z_i) + self.message_edge(edge))
         )
@@ -133,6 +146,9 @@ class GraphEncoder(nn.Module):
 
         Returns:
             embedding ``[*B, n, H]``.
+
+        Raises:
+            ValueError: if the shapes do not fit each other or the network.
         """
         z, position = self._lift(observation, position)
         messages = self._pairwise_messages(z, position)
@@ -157,7 +173,13 @@ class GraphEncoder(nn.Module):
 
         Returns:
             embedding ``[N, H]``.
+
+        Raises:
+            ValueError: if the shapes do not fit each other or the network.
         """
+        if observation.ndim != 2 or edge_index.ndim != 2 or len(edge_index) != 2:
+            seen = f"{list(observation.shape)} and {list(edge_index.shape)}"
+            raise ValueError(f"observation, edge_index: got shapes {seen}, expected [N, {self.in_features}] and [2, E]")
         z, position = self._lift(observation, position)
         return self._update(z, _EdgeMessages(self)(z, position, edge_index))
 
@@ -167,12 +189,19 @@ class GraphEncoder(nn.Module):
         return self._pairwise_messages(z, position).norm(dim=-1) * radius_adjacency(position, self.radius)
 
     def _lift(self, observation: Tensor, position: Tensor | None) -> tuple[Tensor, Tensor]:
-        if observation.shape[-1] != self.in_features:
+        if observation.ndim < 2 or observation.shape[-1] != self.in_features:
             raise ValueError(
                 f"observation: got shape {list(observation.shape)}, expected [*B, n, {self.in_features}]; "
-                "the encoder was built for another observation width"
+                f"the encoder was built for {self.in_features} numbers a robot"
             )
-        return self.act(self.lift(observation)), observation[..., :2] if position is None else position
+        position = observation[..., :2] if position is None else position
+        expected = [*observation.shape[:-1], 2]
+        if list(position.shape) != expected:
+            raise ValueError(
+                f"position: got shape {list(position.shape)}, expected {expected} to go with the observation's shape "
+                f"{list(observation.shape)}"
+            )
+        return self.act(self.lift(observation.to(self.lift.weight.dtype))), _at_least_float32(position)
 
     def _pairwise_messages(self, z: Tensor, position: Tensor) -> Tensor:
         """All messages ``[*B, n, n, H]``; the node terms of the first layer are computed once a robot, not a pair."""
@@ -182,7 +211,7 @@ class GraphEncoder(nn.Module):
             return sent.unsqueeze(-3) - sent.unsqueeze(-2)
         mate = self.message_mate(z)
         mine = self.message_self(z) - mate
-        edge = torch.cat([offset, offset.norm(dim=-1, keepdim=True)], -1)
+        edge = torch.cat([offset, offset.norm(dim=-1, keepdim=True)], -1).to(z.dtype)
         pre = mine.unsqueeze(-2) + mate.unsqueeze(-3) + self.message_edge(edge)
         return self.message_out(self.act(pre))
 

@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import ClassVar
 
 import torch
 from torch import Tensor
@@ -27,11 +26,20 @@ class Sampler:
 
     Raises:
         ValueError: if a number of steps is not positive or more than there are.
+
+    Examples:
+        >>> import torch
+        >>> from redig.modules import NoiseSchedule
+        >>> class Renoise(Sampler):  # noises the estimate afresh at every step, as consistency models do
+        ...     def coefficients(self, schedule, step, previous, older, deterministic):
+        ...         signal = schedule.signal(previous)
+        ...         return signal**0.5, 0.0, 0.0, (1 - signal) ** 0.5
+        >>> toward = lambda action, step: torch.zeros_like(action)  # a denoiser that sees no noise anywhere
+        >>> Renoise(num_steps=3)(toward, torch.ones(4, 2), NoiseSchedule(100)).shape
+        torch.Size([4, 2])
     """
 
     num_steps: int | None = None
-
-    name: ClassVar[str]
 
     def __post_init__(self) -> None:
         self._check_count("num_steps")
@@ -62,8 +70,8 @@ class Sampler:
             deterministic: whether noise is unwanted.
 
         Returns:
-            ``(clean, action, older_clean, noise)``: factors of the estimate of ``a^0`` at this step, of ``a^step``, of
-            the estimate of ``a^0`` at the step before, and of fresh noise.
+            four factors, in this order of the estimate of ``a^0`` at this step, of ``a^step``, of the estimate of
+            ``a^0`` at the step before, and of fresh noise.
         """
         raise NotImplementedError
 
@@ -101,8 +109,8 @@ class Sampler:
         smallest = math.sqrt(schedule.signal(steps[0]))
         if smallest < torch.finfo(latent.dtype).tiny:
             raise ValueError(
-                f"latent: {latent.dtype} cannot hold sqrt(alphas_cumprod[{steps[0]}]) = {smallest:.1e} of the schedule; "
-                "run the chain in float32 (DiffusionActor does, whatever the type of its network)"
+                f"latent: {latent.dtype} cannot hold sqrt(alphas_cumprod[{steps[0]}]) = {smallest:.1e} of the "
+                "schedule; run the chain in float32 (DiffusionActor does, whatever the type of its network)"
             )
         action, older_clean, older = latent, latent, None
         for i, step in enumerate(steps):
@@ -116,7 +124,8 @@ class Sampler:
             if c_older:
                 action = action + c_older * older_clean
             if sigma > 0 and not deterministic:
-                action = action + sigma * torch.empty_like(action).normal_(generator=generator)
+                noise = torch.randn(action.shape, dtype=action.dtype, device=action.device, generator=generator)
+                action = action + sigma * noise
             older_clean, older = clean, step
         return clean
 
@@ -144,12 +153,10 @@ class DDPM(Sampler):
     noise_ratio: float = 1.0
     early_stop: int | None = None
 
-    name = "ddpm"
-
     def __post_init__(self) -> None:
         super().__post_init__()
         self._check_count("early_stop")
-        if self.noise_ratio < 0:
+        if not self.noise_ratio >= 0:
             raise ValueError(f"noise_ratio: got {self.noise_ratio}, must be at least 0")
 
     def timesteps(self, schedule: NoiseSchedule) -> list[int]:
@@ -180,15 +187,14 @@ class DDIM(Sampler):
     Examples:
         >>> import torch
         >>> from redig.modules import NoiseSchedule
-        >>> point = lambda action, step: (action - 0.5 * schedule.signal(step) ** 0.5) / (1 - schedule.signal(step)) ** 0.5
         >>> schedule = NoiseSchedule(100)
-        >>> DDIM(num_steps=4)(point, torch.randn(1, 2), schedule)  # exact noise of data that is 0.5 everywhere
+        >>> def point(action, step):  # the exact noise of data that is 0.5 everywhere
+        ...     return (action - 0.5 * schedule.signal(step) ** 0.5) / (1 - schedule.signal(step)) ** 0.5
+        >>> DDIM(num_steps=4)(point, torch.randn(1, 2), schedule)
         tensor([[0.5000, 0.5000]])
     """
 
     eta: float = 0.0
-
-    name = "ddim"
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -225,8 +231,6 @@ class DPMSolver(Sampler):
         torch.Size([3, 2])
     """
 
-    name = "dpmsolver"
-
     def coefficients(
         self, schedule: NoiseSchedule, step: int, previous: int, older: int | None, deterministic: bool
     ) -> tuple[float, float, float, float]:
@@ -243,6 +247,3 @@ class DPMSolver(Sampler):
 
 def _half_log_snr(signal: float) -> float:
     return 0.5 * math.log(signal / (1 - signal))
-
-
-SAMPLERS: dict[str, type[Sampler]] = {sampler.name: sampler for sampler in (DDPM, DDIM, DPMSolver)}

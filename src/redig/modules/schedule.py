@@ -69,13 +69,14 @@ class NoiseSchedule(nn.Module):
         return keep_precision(self, super()._apply, fn, recurse)
 
     def _load_from_state_dict(self, state_dict, prefix, *args) -> None:
-        super()._load_from_state_dict(state_dict, prefix, *args)
         loaded = state_dict.get(f"{prefix}alphas_cumprod", self.alphas_cumprod).double().cpu()
         expected = torch.tensor(self._signal[:-1], dtype=torch.float64)
         if loaded.shape != expected.shape or not torch.allclose(loaded, expected, rtol=1e-2, atol=1e-12):
             raise ValueError(
-                f"schedule: the weights are of another schedule than {self.kind!r} of {self.num_steps} steps"
+                f"schedule: the weights are of another schedule than {self.kind!r} of {self.num_steps} steps, or were "
+                "saved in float16"
             )
+        super()._load_from_state_dict(state_dict, prefix, *args)
 
     def signal(self, step: int) -> float:
         """``alphas_cumprod[step]`` as a Python number in double precision; 1 for the clean action, step -1.
@@ -133,7 +134,12 @@ class NoiseSchedule(nn.Module):
 
 
 def keep_precision(module: ModuleT, apply: Callable, fn: Callable[[Tensor], Tensor], recurse: bool) -> ModuleT:
-    """``nn.Module._apply`` that moves the module's own buffers to another device, but never below float32."""
+    """``nn.Module._apply`` that moves the module's own buffers to another device, but never below float32.
+
+    Examples:
+        >>> NoiseSchedule(1000).to(torch.bfloat16).alphas_cumprod.dtype  # its _apply is this one
+        torch.float32
+    """
     before = dict(module._buffers)
     apply(fn, recurse)
     for name, buffer in before.items():

@@ -1,0 +1,157 @@
+"""The computation inside the diffusion actor: sample actions by denoising, and score the denoiser on given ones."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import torch
+from torch import Tensor, nn
+from torchrl.envs.utils import ExplorationType, exploration_type
+
+from redig.modules.samplers import Sampler
+from redig.modules.schedule import NoiseSchedule, keep_precision
+
+
+class DiffusionPolicy(nn.Module):
+    """Tensors in, tensors out; :class:`~redig.modules.DiffusionActor` gives it its keys and explains the options.
+
+    The chain runs in [-1, 1] and in float32 or better, whatever the type of the network; actions are scaled to the
+    bounds of the action spec.
+
+    Args:
+        denoiser: module ``(noisy action [*B, A], step [*B], embedding [*B, H]) -> noise [*B, A]``. The action comes in
+            the chain's type: a network in another one casts its inputs itself, as DenoisingMLP does.
+        schedule: noise schedule that the denoiser is trained with.
+        sampler: how the chain goes back.
+        low, high: bounds of the action ``[A]``.
+        generator: source of all randomness; default: torch's global one.
+        latent: whether the latent is an input.
+        warm_start: step at which the chain begins with the previous action, which is an input then.
+
+    Raises:
+        ValueError: if sampler, schedule and ``warm_start`` do not fit each other.
+
+    Examples:
+        >>> import torch
+        >>> from redig.modules import DDPM, DenoisingMLP, NoiseSchedule
+        >>> low, high = torch.zeros(2), torch.full((2,), 4.0)
+        >>> policy = DiffusionPolicy(DenoisingMLP(2, 8), NoiseSchedule(10), DDPM(), low, high)
+        >>> policy(torch.randn(5, 8)).shape
+        torch.Size([5, 2])
+        >>> policy.normalize(torch.tensor([0.0, 4.0]))
+        tensor([-1.,  1.])
+    """
+
+    low: Tensor
+    high: Tensor
+
+    def __init__(
+        self,
+        denoiser: nn.Module,
+        schedule: NoiseSchedule,
+        sampler: Sampler,
+        low: Tensor,
+        high: Tensor,
+        generator: torch.Generator | None = None,
+        latent: bool = False,
+        warm_start: int | None = None,
+    ) -> None:
+        super().__init__()
+        self.denoiser = denoiser
+        self.schedule = schedule
+        self.sampler = sampler
+        self.generator = generator
+        self.reads_latent, self.warm_start = latent, warm_start
+        self.register_buffer("low", low.clone())
+        self.register_buffer("high", high.clone())
+        self.first_step(sampler)  # raises if they do not fit each other
+
+    def _apply(self, fn: Callable[[Tensor], Tensor], recurse: bool = True) -> DiffusionPolicy:
+        return keep_precision(self, super()._apply, fn, recurse)
+
+    def normalize(self, action: Tensor) -> Tensor:
+        """From the bounds of the spec to [-1, 1]."""
+        return 2 * (action - self.low) / (self.high - self.low) - 1
+
+    def denormalize(self, action: Tensor) -> Tensor:
+        """From [-1, 1] to the bounds of the spec."""
+        action = self.low + (action + 1) * (self.high - self.low) / 2
+        return action.maximum(self.low).minimum(self.high)
+
+    def first_step(self, sampler: Sampler) -> int:
+        """Where the chain of a sampler begins: at its noisiest step, with a warm start at the noisiest up to that one.
+
+        Raises:
+            ValueError: if the sampler has more steps than the schedule, or none at or below ``warm_start``.
+        """
+        steps = sampler.timesteps(self.schedule)
+        if self.warm_start is None:
+            return steps[0]
+        if not steps[-1] <= self.warm_start < self.schedule.num_steps:
+            allowed = f"{steps[-1]}, the lowest step of {sampler}, to {self.schedule.num_steps - 1}"
+            raise ValueError(f"warm_start: got {self.warm_start}, must be from {allowed}")
+        return next(step for step in steps if step <= self.warm_start)
+
+    def forward(self, *inputs: Tensor, sampler: Sampler | None = None) -> Tensor | tuple[Tensor, Tensor]:
+        """Sample actions ``[*B, A]``.
+
+        Args:
+            inputs: embeddings ``[*B, H]`` (several are concatenated), then the latent ``[*B, A]`` where one is read,
+                then the previous action ``[*B, A]`` in [-1, 1] with a warm start.
+            sampler: in place of the policy's own, for this call.
+
+        Returns:
+            the action within the bounds; with a warm start also the same in [-1, 1], for the next step.
+        """
+        count = len(inputs) - int(self.reads_latent) - int(self.warm_start is not None)
+        embedding, kept = inputs[:count], inputs[count:]
+        deterministic = exploration_type() not in (ExplorationType.RANDOM, None)
+        shape, device = (*embedding[0].shape[:-1], self.low.shape[-1]), embedding[0].device
+        dtype = torch.promote_types(self.low.dtype, torch.float32)
+        if self.reads_latent:
+            latent = kept[0].to(dtype)
+        elif deterministic:
+            latent = torch.zeros(shape, dtype=dtype, device=device)
+        else:
+            latent = torch.randn(shape, dtype=dtype, device=device, generator=self.generator)
+        sampler = sampler or self.sampler
+        start = self.first_step(sampler)
+        if self.warm_start is not None:
+            signal = self.schedule.signal(start)
+            latent = signal**0.5 * kept[-1] + (1 - signal) ** 0.5 * latent
+        denoise = self._conditioned(*embedding)
+        action = sampler(denoise, latent, self.schedule, self.generator, deterministic, start)
+        return self.denormalize(action) if self.warm_start is None else (self.denormalize(action), action)
+
+    def denoising_error(self, action: Tensor, *embedding: Tensor) -> Tensor:
+        """Squared error of the predicted noise at a random step, Eq. 1 with Eq. 9: ``[*B]``, mean over A.
+
+        Args:
+            action: clean actions ``[*B, A]`` within the bounds.
+            embedding: ``[*B, H]``; several are concatenated.
+
+        Raises:
+            ValueError: if the shapes do not fit each other.
+        """
+        expected = (*embedding[0].shape[:-1], self.low.shape[-1])
+        if action.shape != expected:
+            raise ValueError(
+                f"action: got shape {list(action.shape)}, expected {list(expected)} to go with the embedding's shape "
+                f"{list(embedding[0].shape)}"
+            )
+        clean = self.normalize(action)
+        shape, device = clean.shape[:-1], clean.device
+        step = torch.randint(self.schedule.num_steps, shape, device=device, generator=self.generator)
+        noise = torch.randn(clean.shape, dtype=clean.dtype, device=device, generator=self.generator)
+        predicted = self._conditioned(*embedding)(self.schedule.add_noise(clean, noise, step), step)
+        return (predicted - noise).square().mean(-1)
+
+    def _conditioned(self, *embedding: Tensor) -> Callable[[Tensor, int | Tensor], Tensor]:
+        """The denoiser given the embedding, back in the chain's type."""
+        condition = torch.cat(embedding, -1) if len(embedding) > 1 else embedding[0]
+
+        def denoise(action: Tensor, step: int | Tensor) -> Tensor:
+            step = step if isinstance(step, Tensor) else torch.full((), step, device=action.device)
+            return self.denoiser(action, step, condition).to(action.dtype)
+
+        return denoise
