@@ -73,7 +73,8 @@ def build_sampler(
     Args:
         name: which sampler.
         num_steps: steps of the chain.
-        noise_ratio, early_stop: of :class:`~redig.modules.DDPM`.
+        noise_ratio: of :class:`~redig.modules.DDPM`.
+        early_stop: of DDPM.
         eta: of :class:`~redig.modules.DDIM`.
 
     Raises:
@@ -137,9 +138,7 @@ def build_policy(
         in_keys=[EMBEDDING],
         out_keys=[ACTION],
         schedule=NoiseSchedule(config.diffusion_steps, config.schedule),
-        sampler=build_sampler(
-            config.sampler, config.sampling_steps, config.noise_ratio, config.early_stop, config.eta
-        ),
+        sampler=build_sampler(config.sampler, config.sampling_steps, config.noise_ratio, config.early_stop, config.eta),
         latent_key=LATENT if fixed_latent else None,
         warm_start=warm_start,
     )
@@ -217,7 +216,8 @@ def load_policy(
         path: of the file.
         observation_dim: width of the observations that it will be given, to be checked at once.
         sampler: in place of the one that it was trained with.
-        fixed_latent, warm_start: see :func:`build_policy`.
+        fixed_latent: see :func:`build_policy`.
+        warm_start: see :func:`build_policy`.
 
     Raises:
         FileNotFoundError: if there is no such file.
