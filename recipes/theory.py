@@ -183,6 +183,7 @@ def diffusion_terms(
     few = data[:24]
     terms = {
         "prior_mismatch": prior_mismatch(schedule, actor.module.normalize(data[ACTION])).mean().item(),
+        "matching_error": error.sum().item(),
         "matching_divergence": divergence.sum().item(),
         "discretization_error": discretization_error(actor, few, num_samples=32, generator=generator).mean().item(),
     }

@@ -17,7 +17,8 @@ MARKERS = "os^Dv<"
 HEALTHY = "as it should be"
 TERMS = {  # column of terms.csv: label and unit
     "prior_mismatch": "prior mismatch\n(nats)",
-    "matching_divergence": "matching, sum over k\n(nats)",
+    "matching_error": "matching error,\nas printed",
+    "matching_divergence": "matching divergence\n(nats)",
     "discretization_error": "discretization\n(energy distance)",
     "bellman_residual": "Bellman residual S\n(reward)",
     "coverage": "coverage\n(mean density ratio)",

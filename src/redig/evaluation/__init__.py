@@ -1,5 +1,21 @@
-"""Evaluation: the metrics of the paper, and the driver that measures a policy with them."""
+"""Evaluation: the metrics of the paper, the driver that measures a policy with them, and the terms of its theorems."""
 
+from redig.evaluation.critic_bound import (
+    algorithmic_error,
+    bellman_residual,
+    coverage,
+    coverage_constant,
+    density_ratio,
+    statistical_error,
+)
+from redig.evaluation.diffusion_bound import (
+    discretization_error,
+    discretization_term,
+    matching_divergence,
+    matching_error,
+    prior_mismatch,
+    prior_mismatch_floor,
+)
 from redig.evaluation.evaluate import evaluate, rollout_trajectories
 from redig.evaluation.metrics import (
     contextual_formation_integrity,
@@ -12,12 +28,24 @@ from redig.evaluation.metrics import (
 from redig.evaluation.report import format_table, write_metrics
 
 __all__ = [
+    "algorithmic_error",
+    "bellman_residual",
     "contextual_formation_integrity",
+    "coverage",
+    "coverage_constant",
+    "density_ratio",
+    "discretization_error",
+    "discretization_term",
     "evaluate",
     "format_table",
     "gap_term",
     "jerk",
+    "matching_divergence",
+    "matching_error",
+    "prior_mismatch",
+    "prior_mismatch_floor",
     "rollout_trajectories",
+    "statistical_error",
     "success",
     "team_success",
     "travel_time",

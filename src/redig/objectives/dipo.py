@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import ClassVar
+from typing import Any, ClassVar
 
 import torch
 from tensordict import TensorDictBase
@@ -25,8 +25,8 @@ class DIPOLoss(DiffusionActorCriticLoss):
     * refinement (Sec. 3.2.2): ``a <- a + eta grad_a min(Q1, Q2)(h, a)``, ``refine_steps`` times.
     * ``loss_actor`` (Eq. 1): diffusion loss of the actor on the refined actions.
 
-    Transitions whose optional key ``demonstration`` (bool, ``[*B]`` or ``[*B, 1]``) is true are imitated as they are:
-    their actions are not refined. It is the anchor that keeps online training from destroying a cloned policy.
+    Where the optional flag ``demonstration`` is true, actions are imitated as they are, not refined. It is the anchor
+    that keeps online training from destroying a cloned policy.
 
     DIPO as its authors run it: ``refine_steps=20, refine_optimizer="adam", refine_step_size=0.03,
     refine_grad_norm=0.1 * A``, and improved actions kept in the buffer. For the last, store a copy of each action as
@@ -106,7 +106,7 @@ class DIPOLoss(DiffusionActorCriticLoss):
     ) -> None:
         if refine_from not in REFINE_FROM:
             raise ValueError(f"refine_from: got {refine_from!r}, allowed are {', '.join(REFINE_FROM)}")
-        refinement = {
+        refinement: dict[str, Any] = {
             "steps": refine_steps,
             "step_size": refine_step_size,
             "max_norm": refine_max_norm,
@@ -121,23 +121,21 @@ class DIPOLoss(DiffusionActorCriticLoss):
         """Diffusion loss on refined actions (Eq. 1), and what to log of it."""
         keys = self.tensor_keys
         base_key = keys.base_action or keys.action
-        self._require(tensordict, [*self._present_keys, *([base_key] if self.refine_from == "stored" else [])])
+        self._check(tensordict, [*self._present_keys, *([base_key] if self.refine_from == "stored" else [])])
         embedding = self._embed(tensordict, "encoder_network")
-        executed = tensordict[keys.action]
+        executed = self._action(tensordict, keys.action, embedding)
         if self.refine_from == "policy":
-            with torch.no_grad():
-                base = self._sample_action(embedding, self.actor_network_params)
+            base = self._sample_action(embedding, self.actor_network_params)
         else:
-            base = tensordict[base_key]
+            base = self._action(tensordict, base_key, embedding)
         refined = self.refine(tensordict, base)
-        demonstration = tensordict.get(keys.demonstration, None)
+        demonstration = self._flag(tensordict, keys.demonstration, refined[..., :1])
         if demonstration is not None:
-            demonstration = demonstration.reshape(*tensordict.shape, *[1] * (refined.ndim - tensordict.ndim))
-            refined, base = refined.where(~demonstration, executed), base.where(~demonstration, executed)
+            refined, base = executed.where(demonstration, refined), executed.where(demonstration, base)
         tensordict[keys.refined_action] = refined
-        weights = self._maybe_get_priority_weight(tensordict)
         error = self._denoising_error(embedding, refined)
-        loss = self._reduce(error, tensordict, weights, tensordict.get(keys.actor_mask, None))
+        counted = self._counted(tensordict, error, self._flag(tensordict, keys.actor_mask, error))
+        loss = self._reduce(error, tensordict, counted)
         return loss, {"refine_distance": (refined - base).norm(dim=-1).mean()}
 
     def refine(self, tensordict: TensorDictBase, action: Tensor) -> Tensor:
@@ -155,10 +153,7 @@ class DIPOLoss(DiffusionActorCriticLoss):
         with torch.no_grad():
             embedding = self._critic_embedding(tensordict)
         params = self.qvalue_network_params.detach()
+        low, high = self._bounds
         return refine_actions(
-            action,
-            lambda candidate: self._qvalues(embedding, candidate, params).amin(0),
-            self.actor_network.module.low,
-            self.actor_network.module.high,
-            **self.refinement,
+            action, lambda candidate: self._qvalues(embedding, candidate, params).amin(0), low, high, **self.refinement
         )

@@ -18,17 +18,21 @@ WEIGHTINGS = ("advantage", "exponential")
 class QWeightedLoss(DiffusionActorCriticLoss):
     """Diffusion loss on the policy's own samples, weighted by the critics; needs no gradient of the critics.
 
-    For each state ``num_candidates`` actions are drawn from the actor and valued by ``Q = min(Q1, Q2)``. Then
+    For each state ``num_candidates`` actions are drawn from the actor and valued by ``Q = min(Q1, Q2)``; ``A`` is ``Q``
+    minus its mean over the candidates. Then
 
-    * ``"advantage"`` (QVPO, Ding et al., 2024): the best of them is learned with weight ``Q - V >= 0``, where ``V`` is
-      the mean over the candidates; weights are scaled to a mean of 1 in a batch. ``entropy_weight`` times the diffusion
-      loss of actions drawn uniformly from the bounds is added, which keeps the policy exploring.
-    * ``"exponential"`` (DPMD, Ma et al., 2025): all are learned with weights ``softmax(Q / temperature)`` over the
-      candidates, a step of policy mirror descent, ``pi_new ~ pi_old exp(Q / temperature)``; ``Q`` is divided by its
-      standard deviation over candidates (root mean square over the batch), so that the temperature has no units.
+    * ``"advantage"`` (QVPO, Ding et al., 2024): the best candidate is learned with weight ``A``, divided by its mean
+      over the batch. So are actions drawn uniformly from the bounds, one a state, with ``entropy_weight`` times this
+      weight; they keep the policy exploring. The authors draw ten with 0.02 each, falling to 0.002 during training: in
+      the mean 0.2 to 0.02 here. They do not divide by the mean, and take the best of 4 candidates when they act.
+    * ``"exponential"`` (DPMD, Ma et al., 2025): all candidates are learned, with weights ``softmax(A / temperature)``:
+      a step of policy mirror descent, ``pi_new ~ pi_old exp(Q / temperature)`` for many candidates. ``A`` is divided by
+      its root mean square over candidates and batch, so the temperature has no units. The authors weight one sample a
+      state by ``exp(Q / temperature)``, with ``Q`` standardised over batches.
 
-    Critics, encoders and keys are those of :class:`~redig.objectives.DIPOLoss`. Transitions flagged ``demonstration``
-    are imitated as they are, with weight 1.
+    Robots that do not count (``actor_mask``) and demonstrations are left out of these means. Critics, encoders and keys
+    are those of :class:`~redig.objectives.DIPOLoss`. Where the optional flag ``demonstration`` is true, actions are
+    imitated as they are, with weight 1.
 
     Args:
         encoder, actor, qvalue: see :class:`~redig.objectives.DiffusionActorCriticLoss`.
@@ -92,39 +96,53 @@ class QWeightedLoss(DiffusionActorCriticLoss):
     def actor_loss(self, tensordict: TensorDictBase) -> tuple[Tensor, dict[str, Tensor]]:
         """Weighted diffusion loss (Eq. 1 with weights), and what to log of it."""
         keys = self.tensor_keys
-        self._require(tensordict, self._present_keys)
+        self._check(tensordict, self._present_keys)
         embedding = self._embed(tensordict, "encoder_network")
+        executed = self._action(tensordict, keys.action, embedding)
         candidates, value = self._candidates(tensordict, embedding)
-        spread = value - value.mean(0)
-        if self.weighting == "advantage":
-            best = value.argmax(0, keepdim=True)
-            candidates = candidates.gather(0, best.expand(1, *candidates.shape[1:]))
-            weight = spread.amax(0, keepdim=True)
-            weight = weight / weight.mean().clamp_min(torch.finfo(weight.dtype).eps)
-        else:
-            scale = spread.square().mean().sqrt().clamp_min(torch.finfo(spread.dtype).eps)
-            weight = (spread / (self.temperature * scale)).softmax(0)
-        demonstration = tensordict.get(keys.demonstration, None)
-        if demonstration is not None:
-            demonstration = demonstration.reshape(*tensordict.shape, *[1] * (weight.ndim - 1 - tensordict.ndim))
-            candidates = candidates.where(~demonstration, tensordict[keys.action])
-            weight = weight.where(~demonstration, 1 / len(weight))
-        error = (weight * self._error_of_many(embedding, candidates)).sum(0)
+        advantage, like = value - value.mean(0), value[0]
+        counted = self._counted(tensordict, like, self._flag(tensordict, keys.actor_mask, like))
+        demonstration = self._flag(tensordict, keys.demonstration, like)
+        if demonstration is None:
+            demonstration = torch.zeros_like(like, dtype=torch.bool)
+        candidates, weight = self._weigh(candidates, advantage, counted & ~demonstration)
+        candidates = executed.where(demonstration, candidates)
+        error = (weight.where(~demonstration, 1 / len(weight)) * self._error_of_many(embedding, candidates)).sum(0)
         if self.weighting == "advantage" and self.entropy_weight > 0:
-            low, high = self.actor_network.module.low, self.actor_network.module.high
-            uniform = low + (high - low) * torch.rand_like(candidates)
-            error = error + self.entropy_weight * self._error_of_many(embedding, uniform).sum(0)
-        weights = self._maybe_get_priority_weight(tensordict)
-        loss = self._reduce(error, tensordict, weights, tensordict.get(keys.actor_mask, None))
-        return loss, {"candidate_gap": spread.amax(0).mean()}
+            own = self.entropy_weight * weight[0].where(~demonstration, 0)
+            error = error + own * self._denoising_error(embedding, self._uniform(executed))
+        return self._reduce(error, tensordict, counted), {"candidate_gap": advantage.amax(0).mean()}
+
+    def _weigh(self, candidates: Tensor, advantage: Tensor, counted: Tensor) -> tuple[Tensor, Tensor]:
+        """Actions to learn, ``[N, *B, n, A]``, and their weights, ``[N, *B, n, 1]``; N is 1 with ``"advantage"``."""
+        total, tiny = counted.sum().clamp_min(1), torch.finfo(advantage.dtype).eps
+        if self.weighting == "advantage":
+            weight, best = advantage.max(0, keepdim=True)
+            mean = weight.where(counted, 0).sum() / total
+            return candidates.gather(0, best.expand(1, *candidates.shape[1:])), weight / mean.clamp_min(tiny)
+        square = advantage.square().mean(0).where(counted, 0).sum() / total
+        return candidates, (advantage / (self.temperature * square.sqrt().clamp_min(tiny))).softmax(0)
 
     @torch.no_grad()
     def _candidates(self, tensordict: TensorDictBase, embedding: TensorDictBase) -> tuple[Tensor, Tensor]:
         """Actions drawn from the actor, ``[N, *B, n, A]``, and their values, ``[N, *B, n, 1]``."""
         many = (self.num_candidates, *tensordict.shape)
-        actions = self._sample_action(embedding.expand(many), self.actor_network_params)
+        states = embedding.expand(many)
+        latent = getattr(self.actor_network, "latent_key", None)
+        if latent is not None:  # the one of the batch would give the same action many times
+            states[latent] = torch.empty_like(states[latent]).normal_(generator=self._generator)
+        actions = self._sample_action(states, self.actor_network_params)
         critic_view = self._critic_embedding(tensordict) if self.separate_encoders else embedding
         return actions, self._qvalues(critic_view.expand(many), actions, self.qvalue_network_params).amin(0)
 
     def _error_of_many(self, embedding: TensorDictBase, action: Tensor) -> Tensor:
         return self._denoising_error(embedding.expand(len(action), *embedding.shape), action)
+
+    def _uniform(self, action: Tensor) -> Tensor:
+        low, high = self._bounds
+        return low + (high - low) * torch.empty_like(action).uniform_(generator=self._generator)
+
+    @property
+    def _generator(self) -> torch.Generator | None:
+        """The actor's source of randomness."""
+        return getattr(self.actor_network.module, "generator", None)
