@@ -158,7 +158,7 @@ def train(loss, parameters, make_batch, steps=300, critic_first=0, critic=True):
 
 
 def test_a_diffusion_policy_takes_a_step_of_mirror_descent(monkeypatch):
-    """A Gaussian of mean m and deviation s, weighted by exp(a / (s temperature)), moves to m + s / temperature."""
+    """A Gaussian of mean m and deviation s, weighted by exp(a / (s temperature)), has mean m + s / temperature."""
     temperature = 1.0
     loss = valued_by(
         LinearQ(2), QWeightedLoss, single().actor_network, weighting="exponential", temperature=temperature
@@ -176,9 +176,9 @@ def test_a_diffusion_policy_takes_a_step_of_mirror_descent(monkeypatch):
     old, sample = loss.actor_network_params.data.clone(), loss._sample_action
     monkeypatch.setattr(loss, "_sample_action", lambda embedding, params: sample(embedding, old))
     train(loss, parameters, lambda: bandit(torch.zeros(32, 1)), critic=False)
-    after = act(loss, 4096)
-    assert after.mean().item() == pytest.approx((before.mean() + before.std() / temperature).item(), abs=0.06)
-    assert after.std().item() == pytest.approx(before.std().item(), abs=0.06)
+    shift = (before.std() / temperature).item()
+    assert shift > 0.1  # of the best candidates it would be more than twice that
+    assert act(loss, 4096).mean().item() == pytest.approx(before.mean().item() + shift, abs=0.04)
 
 
 @pytest.mark.parametrize("options", [{"weighting": "advantage"}, {"weighting": "exponential", "temperature": 0.3}])
@@ -187,8 +187,8 @@ def test_solves_a_bandit(options):
     loss = single(QWeightedLoss, num_candidates=8, **options)
     train(loss, loss.parameters(), lambda: bandit(2 * torch.rand(64, 1) - 1), critic_first=100)
     action = act(loss)
-    assert action.mean().item() == pytest.approx(0.6, abs=0.15)
-    assert (action - 0.6).abs().mean() < 0.2
+    assert action.mean().item() == pytest.approx(0.6, abs=0.2)
+    assert (action - 0.6).abs().mean() < 0.25
 
 
 @pytest.mark.parametrize("weighting", WEIGHTINGS)
