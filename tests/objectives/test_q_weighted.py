@@ -185,7 +185,7 @@ def test_a_diffusion_policy_takes_a_step_of_mirror_descent(monkeypatch):
 def test_solves_a_bandit(options):
     """From actions drawn at random; the critic learns first, because early on any action may look the best."""
     loss = single(QWeightedLoss, num_candidates=8, **options)
-    train(loss, loss.parameters(), lambda: bandit(2 * torch.rand(64, 1) - 1), critic_first=100)
+    train(loss, loss.parameters(), lambda: bandit(2 * torch.rand(64, 1) - 1), steps=500, critic_first=300)
     action = act(loss)
     assert action.mean().item() == pytest.approx(0.6, abs=0.2)
     assert (action - 0.6).abs().mean() < 0.25
