@@ -106,14 +106,18 @@ class Config:
     """Critic updates for each step of all teams; the actor is updated half as often."""
     batch_size: int = 52
     """Teams in a batch."""
+    block: int = 20
+    """Critic updates whose TD targets are computed at once, and actions refined; 1: for each update anew, as printed."""
     buffer_size: int = 250_000
     """Capacity of the replay buffer, in team transitions."""
     n_steps: int = 5
     """Length of n-step returns."""
     gamma: float = 0.98
     """Discount factor (paper: 0.99)."""
-    tau: float = 0.01
-    """Rate of the target networks (paper: 0.005)."""
+    tau: float = 0.04
+    """Rate of the target networks (paper: 0.005, at each update)."""
+    target_interval: int = 4
+    """Critic updates between two steps of the target networks; 4 steps of 0.01 are one of 0.04."""
     critic_lr: float = 5e-4
     """Learning rate of the critics (paper: 3e-4)."""
     actor_lr: float = 3e-4
@@ -154,6 +158,8 @@ class Config:
     """Communication range (m)."""
     hidden: int = 128
     """Width of the three hidden layers of denoiser and critics (paper: 256)."""
+    activation: str = "silu"
+    """Nonlinearity of the denoiser: silu, relu, tanh or the paper's mish, which costs nine times more than silu."""
     layer_norm: bool = True
     """LayerNorm in the critics."""
     critic_activation: str = "relu"
@@ -210,11 +216,16 @@ class Config:
                 config = dataclasses.replace(config, **{name: value})
         for name in (
             "num_trajectories", "clone_updates", "clone_batch", "num_envs", "collect_steps", "updates_per_step",
-            "batch_size", "buffer_size", "evaluation_interval", "evaluation_starts", "num_starts", "hidden",
+            "batch_size", "target_interval", "buffer_size", "evaluation_interval", "evaluation_starts", "num_starts", "hidden",
             "best_of_n",
         ):  # fmt: skip
             if getattr(config, name) < 1:
                 raise ValueError(f"{name}: got {getattr(config, name)}, must be at least 1")
+        round_updates = config.collect_steps * config.updates_per_step
+        if config.block < 1 or round_updates % config.block:
+            raise ValueError(
+                f"block: got {config.block}, must divide collect_steps * updates_per_step = {round_updates} updates"
+            )
         for name in ("demonstration_share", "final_share"):
             if not 0 <= getattr(config, name) <= 1:
                 raise ValueError(f"{name}: got {getattr(config, name)}, must be in [0, 1]")

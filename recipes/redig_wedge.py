@@ -33,6 +33,7 @@ from redig.policy import ACTION, EMBEDDING, OBSERVATION, PolicyConfig, build_enc
 
 ARRIVED = ("agents", "info", "arrived")
 BASE_ACTION = ("agents", "policy_action")  # the policy's action before exploration noise
+REFINED_ACTION = ("agents", "refined_action")
 VALIDATION_SEED = 1_000_000  # starts to choose the best policy on; training and final evaluation use others
 
 
@@ -80,20 +81,24 @@ def train(config: Config) -> dict[str, float]:
     )
     experience = iter(collector)
 
-    def batch(share: float) -> TensorDictBase:
-        """Uniform samples of the buffer, a share of them demonstrations."""
+    def batch(updates: int, share: float) -> TensorDictBase:
+        """What a number of updates learn from: uniform samples of the buffer, a share of each batch demonstrations."""
         of_demos = round(config.batch_size * share)
-        imitated = demos[torch.randint(len(demos), (of_demos,))]
-        return torch.cat([buffer.sample(config.batch_size - of_demos).select(*demos.keys(True, True)), imitated])
+        imitated = demos[torch.randint(len(demos), (updates, of_demos))]
+        lived = buffer.sample(updates * (config.batch_size - of_demos)).select(*demos.keys(True, True))
+        return torch.cat([lived.reshape(updates, -1), imitated], 1)
 
-    def update_critics(share: float) -> None:
-        value, _ = loss.qvalue_loss(batch(share))
-        run.step(value, critic_optimizer, config.grad_norm, "loss_q")
-        target.step()
+    def update_critics(updates: int, share: float) -> None:
+        for i, data in enumerate(loss.write_targets(batch(updates, share))):
+            value, _ = loss.td_loss(data)
+            run.step(value, critic_optimizer, config.grad_norm, "loss_q")
+            if i % config.target_interval == 0:
+                target.step()
 
     def update_actor(data: TensorDictBase) -> None:
-        value, _ = loss.actor_loss(data)
-        run.step(value, actor_optimizer, config.grad_norm, "loss_pi")
+        for piece in data:
+            value, _ = loss.diffusion_loss(piece)
+            run.step(value, actor_optimizer, config.grad_norm, "loss_pi")
 
     def validate(phase: str, step: int) -> None:
         metrics = evaluate(policy, validation_env, seed=VALIDATION_SEED + config.seed)
@@ -112,7 +117,8 @@ def train(config: Config) -> dict[str, float]:
     # Clone the demonstrations, so that online training starts from a policy that reaches most goals
     for i in run.loop("clone", config.clone_updates):
         learning_rate(actor_optimizer, config.clone_lr * (1 - 0.9 * i / config.clone_updates))
-        update_actor(demos[torch.randint(len(demos), (config.clone_batch,))])
+        imitated = demos[torch.randint(len(demos), (1, config.clone_batch))]
+        update_actor(imitated.set(REFINED_ACTION, imitated[ACTION]))
         if i + 1 == config.clone_updates:
             copy_to_targets(loss)
             validate("clone", 0)
@@ -120,8 +126,8 @@ def train(config: Config) -> dict[str, float]:
     # Let the critics learn the value of the cloned policy before the actor follows them
     for _ in run.loop("warm-up", config.warmup_steps // config.collect_steps):
         buffer.extend(transitions(next(experience)))
-    for _ in run.loop("critic", config.critic_updates):
-        update_critics(config.demonstration_share)
+    for _ in run.loop("critic", config.critic_updates // config.block):
+        update_critics(config.block, config.demonstration_share)
 
     # Line 3: for each episode
     noise.sigma.fill_(config.exploration_noise)
@@ -135,12 +141,13 @@ def train(config: Config) -> dict[str, float]:
         learning_rate(actor_optimizer, config.actor_lr * (config.final_lr + (1 - config.final_lr) * left))
         learning_rate(critic_optimizer, config.critic_lr * (config.final_lr + (1 - config.final_lr) * left))
         share = config.demonstration_share * max(0.0, 1 - i * config.collect_steps / config.share_steps)
-        for update in range(config.collect_steps * config.updates_per_step):
-            # Lines 9, 10 and 13: a batch, the critic loss (Eq. 2), a step of Q1 and Q2
-            update_critics(max(share, config.final_share))
-            # Lines 11, 6, 7 and 12: refine its actions, the diffusion loss on them (Eq. 1), a step of psi and phi
-            if update % 2:
-                update_actor(batch(max(share / 2, config.final_share)))
+        share, actor_share = max(share, config.final_share), max(share / 2, config.final_share)
+        for done in range(0, config.collect_steps * config.updates_per_step, config.block):
+            # Lines 9, 10 and 13: batches, the critic loss (Eq. 2), a step of Q1 and Q2 for each
+            update_critics(config.block, share)
+            # Lines 11, 6, 7 and 12: refined actions, the diffusion loss on them (Eq. 1), a step of psi and phi for each
+            if actor_updates := (done + config.block) // 2 - done // 2:
+                update_actor(loss.write_refined(batch(actor_updates, actor_share)))
         if config.best_of_n > 1:
             run.figures["best_of_n"] = config.best_of_n
         run.figures["frames/s"] = config.num_envs * config.collect_steps / (time.perf_counter() - started)
@@ -176,6 +183,7 @@ def policy_architecture(config: Config, observation_dim: int) -> PolicyConfig:
         encoder=config.encoder,
         encoder_activation="relu" if config.encoder == "edgeconv" else None,
         hidden=(config.hidden,) * 3,
+        activation=config.activation,
         diffusion_steps=config.diffusion_steps,
         schedule=config.schedule,
         sampling_steps=config.sampling_steps,

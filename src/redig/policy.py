@@ -31,7 +31,7 @@ class PolicyConfig:
         action_low, action_high: bounds of an action (m/s).
         embedding_dim, encoder_hidden, radius, encoder, aggregation, encoder_activation: see
             :class:`~redig.modules.GraphEncoder`.
-        hidden, step_dim: see :class:`~redig.modules.DenoisingMLP`.
+        hidden, step_dim, activation: see :class:`~redig.modules.DenoisingMLP`.
         diffusion_steps, schedule: see :class:`~redig.modules.NoiseSchedule`.
         sampling_steps, noise_ratio, early_stop, sampler, eta: see :func:`build_sampler`.
 
@@ -52,6 +52,7 @@ class PolicyConfig:
     encoder_activation: str | None = "relu"
     hidden: tuple[int, ...] = (256, 256, 256)
     step_dim: int = 16
+    activation: str = "mish"
     diffusion_steps: int = 100
     schedule: str = "cosine"
     sampling_steps: int | None = None
@@ -133,7 +134,7 @@ def build_policy(
     """
     low, high = torch.tensor(config.action_low), torch.tensor(config.action_high)
     actor = DiffusionActor(
-        DenoisingMLP(len(low), config.embedding_dim, config.hidden, config.step_dim),
+        DenoisingMLP(len(low), config.embedding_dim, config.hidden, config.step_dim, config.activation),
         Bounded(low, high, low.shape),
         in_keys=[EMBEDDING],
         out_keys=[ACTION],

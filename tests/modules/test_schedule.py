@@ -84,7 +84,7 @@ def test_posterior_is_the_product_of_two_gaussians(chosen, clean, noisy):
     schedule, (step, previous) = chosen
     if previous < 0:
         return
-    alpha, alpha_previous = (schedule.alphas_cumprod[k].item() for k in (step, previous))
+    alpha, alpha_previous = schedule.signal(step), schedule.signal(previous)  # float32 cannot resolve 1 - alpha
     ratio = alpha / alpha_previous
     # q(x | a0) and, as a function of x, q(a^step | x): both on a grid around the narrower one's peak
     peaks = [(math.sqrt(alpha_previous) * clean, math.sqrt(1 - alpha_previous))]

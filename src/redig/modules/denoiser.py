@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import cast
 
 import torch
@@ -141,3 +141,41 @@ class DenoisingMLP(nn.Module):
         time = sinusoidal_embedding(step.float(), self.step_dim).to(dtype)  # half types would merge high steps
         time = time.expand(*action.shape[:-1], self.step_dim)
         return self.net(torch.cat([action.to(dtype), time, embedding.to(dtype)], -1))
+
+    def prepare(self, embedding: Tensor, steps: Sequence[int]) -> Callable[[Tensor, int], Tensor]:
+        """The network for a whole chain: what the first layer makes of embedding and steps is computed once.
+
+        Args:
+            embedding: ``[*B, H]``.
+            steps: the steps that will be asked for.
+
+        Returns:
+            a function of noisy actions ``[*B, A]`` and one of the steps, with the values of :meth:`forward` up to
+            rounding.
+
+        Raises:
+            ValueError: if the embedding does not fit the network.
+
+        Examples:
+            >>> import torch
+            >>> denoiser, embedding = DenoisingMLP(action_dim=2, embedding_dim=64), torch.randn(8, 5, 64)
+            >>> denoise = denoiser.prepare(embedding, steps=[99, 49])
+            >>> action = torch.randn(8, 5, 2)
+            >>> torch.allclose(denoise(action, 49), denoiser(action, torch.tensor(49), embedding), atol=1e-6)
+            True
+        """
+        check_shapes(embedding.new_empty(*embedding.shape[:-1], self.action_dim), self.action_dim, embedding, self.embedding_dim)
+        first, *rest = self.net
+        dtype = weight_dtype(self.net)
+        of_action, of_time, of_embedding = first.weight.split([self.action_dim, self.step_dim, self.embedding_dim], 1)
+        time = sinusoidal_embedding(torch.tensor(steps, device=embedding.device).float(), self.step_dim).to(dtype)
+        shift = dict(zip(steps, nn.functional.linear(time, of_time).unbind(0), strict=True))
+        base = nn.functional.linear(embedding.to(dtype), of_embedding, first.bias)
+
+        def denoise(action: Tensor, step: int) -> Tensor:
+            hidden = nn.functional.linear(action.to(dtype), of_action, shift[step]) + base
+            for layer in rest:
+                hidden = layer(hidden)
+            return hidden
+
+        return denoise

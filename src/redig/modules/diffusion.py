@@ -8,7 +8,7 @@ import torch
 from torch import Tensor, nn
 from torchrl.envs.utils import ExplorationType, exploration_type
 
-from redig.modules.samplers import Sampler
+from redig.modules.samplers import Denoise, Sampler
 from redig.modules.schedule import NoiseSchedule, keep_precision
 
 
@@ -119,7 +119,8 @@ class DiffusionPolicy(nn.Module):
         if self.warm_start is not None:
             signal = self.schedule.signal(start)
             latent = signal**0.5 * kept[-1] + (1 - signal) ** 0.5 * latent
-        denoise = self._conditioned(*embedding)
+        steps = [step for step in sampler.timesteps(self.schedule) if step <= start]
+        denoise = self._conditioned(steps, *embedding)
         action = sampler(denoise, latent, self.schedule, self.generator, deterministic, start)
         return self.denormalize(action) if self.warm_start is None else (self.denormalize(action), action)
 
@@ -143,15 +144,18 @@ class DiffusionPolicy(nn.Module):
         shape, device = clean.shape[:-1], clean.device
         step = torch.randint(self.schedule.num_steps, shape, device=device, generator=self.generator)
         noise = torch.randn(clean.shape, dtype=clean.dtype, device=device, generator=self.generator)
-        predicted = self._conditioned(*embedding)(self.schedule.add_noise(clean, noise, step), step)
+        condition = torch.cat(embedding, -1) if len(embedding) > 1 else embedding[0]
+        predicted = self.denoiser(self.schedule.add_noise(clean, noise, step), step, condition).to(clean.dtype)
         return (predicted - noise).square().mean(-1)
 
-    def _conditioned(self, *embedding: Tensor) -> Callable[[Tensor, int | Tensor], Tensor]:
+    def _conditioned(self, steps: list[int], *embedding: Tensor) -> Denoise:
         """The denoiser given the embedding, back in the chain's type."""
         condition = torch.cat(embedding, -1) if len(embedding) > 1 else embedding[0]
+        if hasattr(self.denoiser, "prepare"):
+            prepared = self.denoiser.prepare(condition, steps)
+            return lambda action, step: prepared(action, step).to(action.dtype)
 
-        def denoise(action: Tensor, step: int | Tensor) -> Tensor:
-            step = step if isinstance(step, Tensor) else torch.full((), step, device=action.device)
-            return self.denoiser(action, step, condition).to(action.dtype)
+        def denoise(action: Tensor, step: int) -> Tensor:
+            return self.denoiser(action, torch.full((), step, device=action.device), condition).to(action.dtype)
 
         return denoise

@@ -115,17 +115,17 @@ class Sampler:
         action, older_clean, older = latent, latent, None
         for i, step in enumerate(steps):
             signal = schedule.signal(step)
-            clean = (action - math.sqrt(1 - signal) * denoise(action, step)) / math.sqrt(signal)
+            clean = torch.add(action / math.sqrt(signal), denoise(action, step), alpha=-math.sqrt(1 / signal - 1))
             clean = clean.clamp(-1, 1)
             if i + 1 == len(steps):
                 break
             c0, ck, c_older, sigma = self.coefficients(schedule, step, steps[i + 1], older, deterministic)
-            action = c0 * clean + ck * action
+            action = torch.add(ck * action, clean, alpha=c0)
             if c_older:
-                action = action + c_older * older_clean
+                action = torch.add(action, older_clean, alpha=c_older)
             if sigma > 0 and not deterministic:
                 noise = torch.randn(action.shape, dtype=action.dtype, device=action.device, generator=generator)
-                action = action + sigma * noise
+                action = torch.add(action, noise, alpha=sigma)
             older_clean, older = clean, step
         return clean
 

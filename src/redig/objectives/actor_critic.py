@@ -74,6 +74,7 @@ class DiffusionActorCriticLoss(DiffusionActorCriticNetworks):
             action: the action that was executed; the critic learns its value.
             state_action_value: output of the critic.
             reward, done, terminated: under ``"next"``.
+            value_target: where ``write_targets`` leaves the TD targets for ``td_loss``.
             priority: where the TD error is written.
             priority_weight: optional weight of each transition, as a prioritized buffer writes it.
             demonstration: optional flag of what to imitate as it is. Like the next two, one for the team, ``[*B]`` or
@@ -88,6 +89,7 @@ class DiffusionActorCriticLoss(DiffusionActorCriticNetworks):
         reward: NestedKey = "reward"
         done: NestedKey = "done"
         terminated: NestedKey = "terminated"
+        value_target: NestedKey = "value_target"
         priority: NestedKey = "td_error"
         priority_weight: NestedKey = "priority_weight"
         demonstration: NestedKey = "demonstration"
@@ -179,9 +181,28 @@ class DiffusionActorCriticLoss(DiffusionActorCriticNetworks):
 
     def qvalue_loss(self, tensordict: TensorDictBase) -> tuple[Tensor, dict[str, Tensor]]:
         """TD error of all critics (Eq. 2), summed over critics, and what to log of it."""
-        keys = self.tensor_keys
         self._check(tensordict, self.in_keys)
         target, next_value = self._target_value(tensordict)
+        loss, metadata = self._td_error(tensordict, target)
+        return loss, {**metadata, "next_state_value": next_value.mean()}
+
+    def write_targets(self, tensordict: TensorDictBase) -> TensorDictBase:
+        """Write the TD targets of a batch into it, under ``value_target``, for :meth:`td_loss`.
+
+        The two together are :meth:`qvalue_loss`. Targets need no gradient, so those of several updates can be computed
+        at once, in a batch large enough to keep the processor busy; they then share one state of the target networks.
+        """
+        self._check(tensordict, self.in_keys)
+        return tensordict.set(self.tensor_keys.value_target, self._target_value(tensordict)[0])
+
+    def td_loss(self, tensordict: TensorDictBase) -> tuple[Tensor, dict[str, Tensor]]:
+        """TD error (Eq. 2) against the targets that :meth:`write_targets` left in the batch, and what to log of it."""
+        key = self.tensor_keys.value_target
+        self._check(tensordict, [*self._present_keys, key])
+        return self._td_error(tensordict, tensordict[key])
+
+    def _td_error(self, tensordict: TensorDictBase, target: Tensor) -> tuple[Tensor, dict[str, Tensor]]:
+        keys = self.tensor_keys
         embedding = self._critic_embedding(tensordict)
         if self.detach_encoder:
             embedding = embedding.detach()
@@ -191,7 +212,6 @@ class DiffusionActorCriticLoss(DiffusionActorCriticNetworks):
         return self._reduce(loss, tensordict, self._counted(tensordict, loss)), {
             "pred_value": value.detach().mean(),
             "target_value": target.mean(),
-            "next_state_value": next_value.mean(),
         }
 
     def actor_loss(self, tensordict: TensorDictBase) -> tuple[Tensor, dict[str, Tensor]]:

@@ -119,24 +119,55 @@ class DIPOLoss(DiffusionActorCriticLoss):
 
     def actor_loss(self, tensordict: TensorDictBase) -> tuple[Tensor, dict[str, Tensor]]:
         """Diffusion loss on refined actions (Eq. 1), and what to log of it."""
-        keys = self.tensor_keys
-        base_key = keys.base_action or keys.action
-        self._check(tensordict, [*self._present_keys, *([base_key] if self.refine_from == "stored" else [])])
+        self._check(tensordict, self._actor_keys)
         embedding = self._embed(tensordict, "encoder_network")
-        executed = self._action(tensordict, keys.action, embedding)
+        distance = self._write_refined(tensordict, embedding)
+        return self._loss_on_refined(tensordict, embedding), {"refine_distance": distance}
+
+    def write_refined(self, tensordict: TensorDictBase) -> TensorDictBase:
+        """Write the refined actions of a batch into it, under ``refined_action``, for :meth:`diffusion_loss`.
+
+        The two together are :meth:`actor_loss`. Refinement needs no gradient of the networks' parameters, so the
+        actions of several updates can be refined at once; they then share one state of the critics.
+        """
+        self._check(tensordict, self._actor_keys)
+        self._write_refined(tensordict)
+        return tensordict
+
+    def diffusion_loss(self, tensordict: TensorDictBase) -> tuple[Tensor, dict[str, Tensor]]:
+        """Diffusion loss (Eq. 1) on the actions that :meth:`write_refined` left in the batch; nothing to log."""
+        self._check(tensordict, [*self._present_keys, self.tensor_keys.refined_action])
+        return self._loss_on_refined(tensordict, self._embed(tensordict, "encoder_network")), {}
+
+    @property
+    def _actor_keys(self) -> list[NestedKey]:
+        """The keys that refinement and the diffusion loss read."""
+        keys = self.tensor_keys
+        return [*self._present_keys, *([keys.base_action or keys.action] if self.refine_from == "stored" else [])]
+
+    @torch.no_grad()
+    def _write_refined(self, tensordict: TensorDictBase, embedding: TensorDictBase | None = None) -> Tensor:
+        """Refine the actions of a batch, given the actor's embedding if it is there; the mean distance they moved."""
+        keys = self.tensor_keys
+        critic_view = self._critic_embedding(tensordict)
+        executed = self._action(tensordict, keys.action, critic_view)
         if self.refine_from == "policy":
+            embedding = self._embed(tensordict, "encoder_network") if embedding is None else embedding
             base = self._sample_action(embedding, self.actor_network_params)
         else:
-            base = self._action(tensordict, base_key, embedding)
-        refined = self.refine(tensordict, base)
+            base = self._action(tensordict, keys.base_action or keys.action, critic_view)
+        refined = self._refine(critic_view, base)
         demonstration = self._flag(tensordict, keys.demonstration, refined[..., :1])
         if demonstration is not None:
             refined, base = executed.where(demonstration, refined), executed.where(demonstration, base)
         tensordict[keys.refined_action] = refined
-        error = self._denoising_error(embedding, refined)
+        return (refined - base).norm(dim=-1).mean()
+
+    def _loss_on_refined(self, tensordict: TensorDictBase, embedding: TensorDictBase) -> Tensor:
+        keys = self.tensor_keys
+        error = self._denoising_error(embedding, tensordict[keys.refined_action])
         counted = self._counted(tensordict, error, self._flag(tensordict, keys.actor_mask, error))
-        loss = self._reduce(error, tensordict, counted)
-        return loss, {"refine_distance": (refined - base).norm(dim=-1).mean()}
+        return self._reduce(error, tensordict, counted)
 
     def refine(self, tensordict: TensorDictBase, action: Tensor) -> Tensor:
         """Improve actions along the critics' gradient, ``a + eta grad_a min(Q1, Q2)``.
@@ -148,10 +179,13 @@ class DIPOLoss(DiffusionActorCriticLoss):
         Returns:
             refined action ``[*B, n, A]`` within the bounds of the actor, detached.
         """
-        if self.refinement["steps"] == 0:
-            return action.detach()
         with torch.no_grad():
             embedding = self._critic_embedding(tensordict)
+        return self._refine(embedding, action)
+
+    def _refine(self, embedding: TensorDictBase, action: Tensor) -> Tensor:
+        if self.refinement["steps"] == 0:
+            return action.detach()
         params = self.qvalue_network_params.detach()
         low, high = self._bounds
         return refine_actions(
