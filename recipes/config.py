@@ -106,8 +106,9 @@ class Config:
     """Critic updates for each step of all teams; the actor is updated half as often."""
     batch_size: int = 52
     """Teams in a batch."""
-    block: int = 20
-    """Critic updates whose TD targets are computed at once, and actions refined; 1: for each update anew, as printed."""
+    block: int = 4
+    """Critic updates whose TD targets are computed at once, and actions refined; then the target networks step once.
+    1: for each update anew, as printed; tau is then 0.01."""
     buffer_size: int = 250_000
     """Capacity of the replay buffer, in team transitions."""
     n_steps: int = 5
@@ -115,9 +116,7 @@ class Config:
     gamma: float = 0.98
     """Discount factor (paper: 0.99)."""
     tau: float = 0.04
-    """Rate of the target networks (paper: 0.005, at each update)."""
-    target_interval: int = 4
-    """Critic updates between two steps of the target networks; 4 steps of 0.01 are one of 0.04."""
+    """Rate of the target networks, once a block (paper: 0.005, at each update)."""
     critic_lr: float = 5e-4
     """Learning rate of the critics (paper: 3e-4)."""
     actor_lr: float = 3e-4
@@ -216,7 +215,7 @@ class Config:
                 config = dataclasses.replace(config, **{name: value})
         for name in (
             "num_trajectories", "clone_updates", "clone_batch", "num_envs", "collect_steps", "updates_per_step",
-            "batch_size", "target_interval", "buffer_size", "evaluation_interval", "evaluation_starts", "num_starts", "hidden",
+            "batch_size", "buffer_size", "evaluation_interval", "evaluation_starts", "num_starts", "hidden",
             "best_of_n",
         ):  # fmt: skip
             if getattr(config, name) < 1:

@@ -89,11 +89,10 @@ def train(config: Config) -> dict[str, float]:
         return torch.cat([lived.reshape(updates, -1), imitated], 1)
 
     def update_critics(updates: int, share: float) -> None:
-        for i, data in enumerate(loss.write_targets(batch(updates, share))):
+        for data in loss.write_targets(batch(updates, share)):
             value, _ = loss.td_loss(data)
             run.step(value, critic_optimizer, config.grad_norm, "loss_q")
-            if i % config.target_interval == 0:
-                target.step()
+        target.step()
 
     def update_actor(data: TensorDictBase) -> None:
         for piece in data:
