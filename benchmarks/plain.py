@@ -1,12 +1,13 @@
-"""One update of ReDiG written plainly, as the paper prints it: the baseline of ``update.py`` and the oracle of its test.
+"""One update of ReDiG written plainly, as printed: the baseline of ``update.py`` and the oracle of its test.
 
-Nothing here is from this library but the networks themselves: no precomputed terms, no strided chains, one network after
-the other, one concatenation a call.
+Nothing here is from this library: no precomputed terms, no strided chains, one network after the other, one
+concatenation a call.
 """
 
 from __future__ import annotations
 
 import math
+from itertools import pairwise
 
 import torch
 from torch import Tensor, nn
@@ -52,7 +53,8 @@ class PlainUpdate:
                 return clean
             before = self.alphas[k - 1]
             ratio = alpha / before
-            action = before.sqrt() * (1 - ratio) / (1 - alpha) * clean + ratio.sqrt() * (1 - before) / (1 - alpha) * action
+            c0, ck = before.sqrt() * (1 - ratio) / (1 - alpha), ratio.sqrt() * (1 - before) / (1 - alpha)
+            action = c0 * clean + ck * action
         raise AssertionError("a schedule has at least one step")
 
     def critic_loss(self, state: Tensor, action: Tensor, reward: Tensor, following: Tensor, ended: Tensor) -> Tensor:
@@ -93,7 +95,7 @@ class PlainDenoiser(nn.Module):
         super().__init__()
         widths = [2 + step_dim + embedding_dim, hidden, hidden, hidden]
         layers: list[nn.Module] = []
-        for before, after in zip(widths, widths[1:], strict=False):
+        for before, after in pairwise(widths):
             layers += [nn.Linear(before, after), activation()]
         self.net = nn.Sequential(*layers, nn.Linear(hidden, 2))
         self.step_dim = step_dim
@@ -140,7 +142,7 @@ class PlainCritic(nn.Module):
         super().__init__()
         widths = [embedding_dim + 2, hidden, hidden, hidden]
         layers: list[nn.Module] = []
-        for before, after in zip(widths, widths[1:], strict=False):
+        for before, after in pairwise(widths):
             layers += [nn.Linear(before, after), nn.LayerNorm(after), nn.ReLU()]
         self.net = nn.Sequential(*layers, nn.Linear(hidden, 1))
 

@@ -90,8 +90,8 @@ def main(arguments: Arguments) -> list[dict[str, Any]]:
             )
         parts += [{"hidden": hidden, **row} for row in where_time_goes(recipe, batch, arguments.repeats)]
     notes = [
-        f"Batch: {arguments.teams} teams of {arguments.robots} robots, K = {arguments.diffusion_steps}. *Difference*: the "
-        "largest between the two losses of plain and ours at K steps, on the same weights, batch and random numbers."
+        f"Batch: {arguments.teams} teams of {arguments.robots} robots, K = {arguments.diffusion_steps}. *Difference*: "
+        "the largest between the losses of plain and ours at K steps, on the same weights, batch and random numbers."
     ]
     report(arguments.out, "update", rows, notes)
     report(arguments.out, "update_parts", parts, ["Five steps, SiLU, no blocks: the recipe's networks."])
@@ -142,7 +142,10 @@ def pair(config: PolicyConfig) -> tuple[PlainUpdate, DIPOLoss]:
     hidden, activation = config.hidden[0], ACTIVATIONS[config.activation]
     encoder, critic_encoder = PlainEncoder(), PlainEncoder()
     denoiser, critics = PlainDenoiser(hidden, activation=activation), [PlainCritic(hidden) for _ in range(2)]
-    for module, params in ((encoder, loss.encoder_network_params), (critic_encoder, loss.critic_encoder_network_params)):
+    for module, params in (
+        (encoder, loss.encoder_network_params),
+        (critic_encoder, loss.critic_encoder_network_params),
+    ):
         source = GraphEncoder(9)
         source.load_state_dict(params["module"].flatten_keys(".").to_dict())
         copy_encoder(source, module)
@@ -193,9 +196,7 @@ def plain_update(plain: PlainUpdate, batch: TensorDictBase) -> Callable[[], None
         step(plain.critic_loss(state, action, *rest), optimizers[0])
         step(plain.actor_loss(state, action), optimizers[1])
         with torch.no_grad():
-            for target, source in zip(
-                targets.parameters(), [*critic.parameters(), *actor.parameters()], strict=True
-            ):
+            for target, source in zip(targets.parameters(), [*critic.parameters(), *actor.parameters()], strict=True):
                 target.mul_(0.99).add_(0.01 * source)
 
     return update

@@ -112,7 +112,9 @@ def evaluations(run: Path) -> list[dict[str, float]]:
 
 def reached(metrics: dict[str, float]) -> bool:
     """Whether all targets are reached; a travel time of nobody is none."""
-    return all((metrics[name] >= value) if least else (metrics[name] <= value) for name, (value, least) in TARGETS.items())
+    return all(
+        metrics[name] >= value if at_least else metrics[name] <= value for name, (value, at_least) in TARGETS.items()
+    )
 
 
 if __name__ == "__main__":

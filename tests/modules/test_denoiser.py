@@ -118,3 +118,37 @@ def test_half_precision_tells_high_steps_apart():
 def test_shapes_that_do_not_fit(action, step, embedding, message):
     with pytest.raises(ValueError, match=message):
         DenoisingMLP(2, 6)(torch.zeros(action), torch.zeros(step), torch.zeros(embedding))
+
+
+@settings(deadline=None, max_examples=30)
+@given(
+    st.lists(st.integers(0, 999), min_size=1, max_size=6, unique=True),
+    st.sampled_from([(), (3,), (2, 5)]),
+    st.sampled_from(["mish", "silu", "relu", "tanh"]),
+    st.integers(0, 10),
+)
+def test_a_prepared_chain_has_the_values_and_gradients_of_single_calls(steps, batch, activation, seed):
+    torch.manual_seed(seed)
+    denoiser = DenoisingMLP(2, 6, hidden=(16, 8), step_dim=4, activation=activation).double()
+    embedding = torch.randn(*batch, 6, dtype=torch.float64, requires_grad=True)
+    prepared = denoiser.prepare(embedding, steps)
+    for step in steps:
+        action = torch.randn(*batch, 2, dtype=torch.float64, requires_grad=True)
+        found, expected = prepared(action, step), denoiser(action, torch.tensor(step), embedding)
+        torch.testing.assert_close(found, expected, atol=1e-6, rtol=0)
+        inputs = [action, embedding, *denoiser.parameters()]
+        gradients = [torch.autograd.grad(out.sum(), inputs, retain_graph=True) for out in (found, expected)]
+        torch.testing.assert_close(*gradients, atol=1e-6, rtol=0)
+
+
+def test_a_prepared_chain_of_another_type():
+    denoiser = DenoisingMLP(2, 6, hidden=(16,)).to(torch.bfloat16)
+    action, embedding = torch.randn(3, 2), torch.randn(3, 6)
+    found = denoiser.prepare(embedding, [7])(action, 7)
+    assert found.dtype == torch.bfloat16
+    torch.testing.assert_close(found, denoiser(action, torch.tensor(7), embedding), atol=0.05, rtol=0)
+
+
+def test_a_prepared_chain_checks_the_embedding():
+    with pytest.raises(ValueError, match=r"embedding: got shape \[3, 5\], expected \[3, 6\]"):
+        DenoisingMLP(2, 6).prepare(torch.zeros(3, 5), [1])

@@ -164,8 +164,9 @@ class DenoisingMLP(nn.Module):
             >>> torch.allclose(denoise(action, 49), denoiser(action, torch.tensor(49), embedding), atol=1e-6)
             True
         """
-        check_shapes(embedding.new_empty(*embedding.shape[:-1], self.action_dim), self.action_dim, embedding, self.embedding_dim)
-        first, *rest = self.net
+        action_shape = (*embedding.shape[:-1], self.action_dim)
+        check_shapes(embedding.new_empty(action_shape), self.action_dim, embedding, self.embedding_dim)
+        first, rest = cast(nn.Linear, self.net[0]), list(self.net)[1:]
         dtype = weight_dtype(self.net)
         of_action, of_time, of_embedding = first.weight.split([self.action_dim, self.step_dim, self.embedding_dim], 1)
         time = sinusoidal_embedding(torch.tensor(steps, device=embedding.device).float(), self.step_dim).to(dtype)

@@ -20,7 +20,8 @@ class DiffusionPolicy(nn.Module):
 
     Args:
         denoiser: module ``(noisy action [*B, A], step [*B], embedding [*B, H]) -> noise [*B, A]``. The action comes in
-            the chain's type: a network in another one casts its inputs itself, as DenoisingMLP does.
+            the chain's type: a network in another one casts its inputs itself, as DenoisingMLP does. Chains go through
+            its method ``prepare`` if it has one, see :meth:`~redig.modules.DenoisingMLP.prepare`.
         schedule: noise schedule that the denoiser is trained with.
         sampler: how the chain goes back.
         low, high: bounds of the action ``[A]``.
@@ -151,8 +152,9 @@ class DiffusionPolicy(nn.Module):
     def _conditioned(self, steps: list[int], *embedding: Tensor) -> Denoise:
         """The denoiser given the embedding, back in the chain's type."""
         condition = torch.cat(embedding, -1) if len(embedding) > 1 else embedding[0]
-        if hasattr(self.denoiser, "prepare"):
-            prepared = self.denoiser.prepare(condition, steps)
+        prepare: Callable[[Tensor, list[int]], Denoise] | None = getattr(self.denoiser, "prepare", None)
+        if prepare is not None:
+            prepared = prepare(condition, steps)
             return lambda action, step: prepared(action, step).to(action.dtype)
 
         def denoise(action: Tensor, step: int) -> Tensor:
