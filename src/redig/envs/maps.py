@@ -55,29 +55,38 @@ class ObstacleMap:
             distance ``[*B]`` (m), negative inside an obstacle, and direction ``[*B, 2]``. Inside an obstacle the
             direction points away from the nearest way out of that obstacle.
         """
-        centre, half, heading, radius = self.obstacles.split([2, 2, 1, 1], -1)
-        cos, sin = heading.cos().squeeze(-1), heading.sin().squeeze(-1)
-        offset = point.unsqueeze(-2) - centre  # [*B, M, 2]
-        x, y = offset.unbind(-1)
-        local = torch.stack([cos * x + sin * y, cos * y - sin * x], -1)
-        excess = local.abs() - half
-        outside = excess.clamp_min(0)
-        outside_norm = outside.norm(dim=-1)
-        distance = outside_norm + excess.amax(-1).clamp_max(0) - radius.squeeze(-1)
-        closest = distance.argmin(-1, keepdim=True)  # [*B, 1]
+        local, excess, distance = self._boxes(point)
+        distance, closest = distance.min(0, keepdim=True)  # [1, *B]
         pick = closest.unsqueeze(-1).expand(*closest.shape, 2)
-        local, excess, outside = (t.gather(-2, pick).squeeze(-2) for t in (local, excess, outside))
-        inside_axis = torch.nn.functional.one_hot(excess.argmax(-1), 2).to(point.dtype)
-        norm = outside_norm.gather(-1, closest)
+        local, excess = local.gather(0, pick).squeeze(0), excess.gather(0, pick).squeeze(0)
+        outside = excess.clamp_min(0)
+        norm = outside.norm(dim=-1, keepdim=True)
+        along_x = excess[..., 0] >= excess[..., 1]
+        inside_axis = torch.stack([along_x, ~along_x], -1).to(point.dtype)
         sign = torch.where(local < 0, -1.0, 1.0).to(point.dtype)
-        normal = sign * torch.where(norm > 0, outside / norm.clamp_min(1e-9), inside_axis)
-        c, s = cos[closest.squeeze(-1)], sin[closest.squeeze(-1)]
-        normal = torch.stack([c * normal[..., 0] - s * normal[..., 1], s * normal[..., 0] + c * normal[..., 1]], -1)
-        return distance.gather(-1, closest).squeeze(-1), -normal
+        x, y = (sign * torch.where(norm > 0, outside / norm.clamp_min(1e-9), inside_axis)).unbind(-1)
+        heading = self.obstacles[:, 4]
+        cos, sin = heading.cos()[closest.squeeze(0)], heading.sin()[closest.squeeze(0)]
+        return distance.squeeze(0), -torch.stack([cos * x - sin * y, sin * x + cos * y], -1)
 
     def signed_distance(self, point: Tensor) -> Tensor:
         """Signed distance (m) from ``point`` ``[*B, 2]`` to the nearest obstacle: ``[*B]``."""
-        return self.nearest(point)[0]
+        return self._boxes(point)[2].amin(0)
+
+    def _boxes(self, point: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """In the frame of each box the point and how far it exceeds the half sizes, ``[M, *B, 2]``; its distance.
+
+        Boxes come first, so that the innermost loops run over many points and not over a few boxes.
+        """
+        shape = (-1, *[1] * (point.ndim - 1))
+        centre_x, centre_y, half_x, half_y, heading, radius = (o.view(shape) for o in self.obstacles.unbind(-1))
+        cos, sin = heading.cos(), heading.sin()
+        x, y = point[..., 0] - centre_x, point[..., 1] - centre_y  # [M, *B]
+        x, y = cos * x + sin * y, cos * y - sin * x
+        excess_x, excess_y = x.abs() - half_x, y.abs() - half_y
+        excess = torch.stack([excess_x, excess_y], -1)
+        inside = torch.maximum(excess_x, excess_y).clamp_max(0)
+        return torch.stack([x, y], -1), excess, excess.clamp_min(0).norm(dim=-1) + inside - radius
 
 
 def corridor(width: float = 1.1, length: float = 2.0, angle: float = 0.0, wall: float = 3.0) -> ObstacleMap:

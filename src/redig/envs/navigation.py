@@ -91,7 +91,7 @@ class FormationNavigation(BaseScenario):
         self.direction = self.axis.expand(batch_dim, 2).clone()
         self.arrived = torch.zeros(batch, dtype=torch.bool, device=device)
         self.held = torch.zeros(batch_dim, dtype=torch.long, device=device)
-        self.quantities: dict[str, Tensor] = {}
+        self._quantities: dict[str, Tensor] | None = None
         return world
 
     def _read_arguments(self, kwargs: dict) -> None:
@@ -152,14 +152,15 @@ class FormationNavigation(BaseScenario):
         batch = self.goal[index].shape[0]
         _, start = self._formation_at(-self.start_distance, batch)
         goal_heading, goal = self._formation_at(self.start_distance, batch)
-        for name, place in (("start", start), ("goal", goal)):
-            inside = self.obstacle_map.signed_distance(place) < self.radius
-            if inside.any():
-                env, robot = inside.nonzero()[0].tolist()
-                raise ValueError(
-                    f"start_distance: with {self.start_distance} m the {name} of robot {robot} lies inside a wall, at "
-                    f"{[round(x, 2) for x in place[env, robot].tolist()]} m; choose a larger distance or less jitter"
-                )
+        places = torch.stack([start, goal])
+        inside = self.obstacle_map.signed_distance(places) < self.radius
+        if inside.any():
+            which, env, robot = inside.nonzero()[0].tolist()
+            raise ValueError(
+                f"start_distance: with {self.start_distance} m the {('start', 'goal')[which]} of robot {robot} lies "
+                f"inside a wall, at {[round(x, 2) for x in places[which, env, robot].tolist()]} m; choose a larger "
+                "distance or less jitter"
+            )
         self.direction[index] = goal_heading
         self.goal[index] = goal
         self.arrived[index] = False
@@ -169,7 +170,7 @@ class FormationNavigation(BaseScenario):
             agent.set_vel(
                 torch.zeros_like(agent.state.vel if env_index is None else start[0, i]), batch_index=env_index
             )
-        self._measure(self._positions())
+        self._quantities = None
 
     def _formation_at(self, distance: float, batch: int) -> tuple[Tensor, Tensor]:
         """Headings ``[batch, 2]`` and robots' places ``[batch, n, 2]`` of randomised formations along the corridor."""
@@ -205,8 +206,9 @@ class FormationNavigation(BaseScenario):
         position, velocity = self._positions(), self._velocities()
         obstacle_distance = self.obstacle_map.signed_distance(position)
         wall = obstacle_distance < self.radius
-        free = rewards.clearance(position, obstacle_distance, self.radius)
-        mate = rewards.clearance(position, torch.full_like(obstacle_distance, 1e9), self.radius) < 0
+        mate_clearance = rewards.mate_clearance(position, self.radius)
+        mate = mate_clearance < 0
+        free = torch.minimum(mate_clearance, obstacle_distance - self.radius)
         position, velocity = part_robots(position, velocity, self.radius)
         position, velocity = leave_walls(position, velocity, self.radius, *self.obstacle_map.nearest(position))
         for i, agent in enumerate(self.world.agents):
@@ -230,7 +232,7 @@ class FormationNavigation(BaseScenario):
             - self.proximity_penalty * rewards.proximity(free, self.proximity_margin),
         }
         terminated = (collision & self.collision_terminates) | (self.arrived & self.arrival_terminates)
-        self._measure(position, parts, wall, mate, terminated)
+        self._quantities = self._measure(position, velocity, parts, wall, mate, terminated)
 
     def _formation_reward(self, position: Tensor, velocity: Tensor) -> Tensor:
         if self.formation_reward == "scaled":
@@ -244,17 +246,26 @@ class FormationNavigation(BaseScenario):
             bonus = position.new_zeros(position.shape[:2])
         return self.formation_weight * bonus
 
+    @property
+    def quantities(self) -> dict[str, Tensor]:
+        """Everything that ``observation``, ``reward`` and ``info`` hand out, for the whole team: ``[B, n, ...]``.
+
+        Measured after each step; after resets when first asked for, as VMAS resets environments one by one.
+        """
+        if self._quantities is None:
+            self._quantities = self._measure(self._positions(), self._velocities())
+        return self._quantities
+
     def _measure(
         self,
         position: Tensor,
+        velocity: Tensor,
         parts: dict[str, Tensor] | None = None,
         wall: Tensor | None = None,
         mate: Tensor | None = None,
         terminated: Tensor | None = None,
-    ) -> None:
-        """Everything that ``observation``, ``reward`` and ``info`` hand out, for the whole team: ``[B, n, ...]``."""
+    ) -> dict[str, Tensor]:
         zero = position.new_zeros(position.shape[:2])
-        velocity = self._velocities()
         distance, direction = self.obstacle_map.nearest(position)
         observation = [position, velocity, self.goal - position, distance.unsqueeze(-1)]
         if self.observe_direction:
@@ -263,7 +274,7 @@ class FormationNavigation(BaseScenario):
         parts = parts or dict.fromkeys(names, zero)
         wall = zero if wall is None else wall.to(zero.dtype)
         mate = zero if mate is None else mate.to(zero.dtype)
-        self.quantities = {
+        return {
             "observation": torch.cat(observation, -1),
             "reward": torch.stack(list(parts.values())).sum(0),
             "position": position,
@@ -289,7 +300,7 @@ class FormationNavigation(BaseScenario):
         for i, agent in enumerate(self.world.agents):
             agent.set_pos(state["position"][:, i], batch_index=None)
             agent.set_vel(state["velocity"][:, i], batch_index=None)
-        self._measure(self._positions())
+        self._quantities = None
 
     def observation(self, agent: Agent) -> Tensor:
         """State of one robot ``[B, 9]`` (or 7)."""

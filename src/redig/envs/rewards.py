@@ -185,10 +185,19 @@ def clearance(position: Tensor, obstacle_distance: Tensor, radius: float) -> Ten
         >>> clearance(position, torch.tensor([3.0, 0.5]), radius=0.25)  # the mate is nearer, the wall is nearer
         tensor([0.5000, 0.2500])
     """
-    n = position.shape[-2]
-    myself = torch.eye(n, dtype=torch.bool, device=position.device)
-    mate = pairwise_distances(position).masked_fill(myself, float("inf")).amin(-1) - 2 * radius
-    return torch.minimum(mate, obstacle_distance - radius)
+    return torch.minimum(mate_clearance(position, radius), obstacle_distance - radius)
+
+
+def mate_clearance(position: Tensor, radius: float) -> Tensor:
+    """Free space between each robot ``[*B, n, 2]`` (m) and the nearest teammate: ``[*B, n]`` (m), 0 at contact.
+
+    Examples:
+        >>> import torch
+        >>> mate_clearance(torch.tensor([[0.0, 0.0], [1.0, 0.0], [1.0, 3.0]]), radius=0.25)
+        tensor([0.5000, 0.5000, 2.5000])
+    """
+    myself = torch.eye(position.shape[-2], dtype=torch.bool, device=position.device)
+    return pairwise_distances(position).masked_fill(myself, float("inf")).amin(-1) - 2 * radius
 
 
 def proximity(clearance: Tensor, margin: float = 0.1) -> Tensor:
