@@ -111,6 +111,8 @@ class Config:
     1: for each update anew, as printed; tau is then 0.01."""
     buffer_size: int = 250_000
     """Capacity of the replay buffer, in team transitions."""
+    buffer_on_disk: bool = False
+    """Keep the replay buffer in the folder of the run (about 0.7 GB for a million teams of five), not in memory."""
     n_steps: int = 5
     """Length of n-step returns."""
     gamma: float = 0.98

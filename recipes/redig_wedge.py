@@ -24,6 +24,7 @@ from torchrl.modules import AdditiveGaussianModule
 from torchrl.objectives import SoftUpdate
 
 from redig.checkpoint import collection_state, set_collection_state
+from redig.disk_storage import DiskStorage
 from redig.envs.factory import make_env
 from redig.evaluation import evaluate
 from redig.modules import BestOfN, QNetwork
@@ -64,7 +65,9 @@ def train(config: Config) -> dict[str, float]:
     cache = folder.parent / "demonstrations"
     episodes = demonstrations(demo_env, config.num_trajectories, config.planner, seed=config.seed, cache_dir=cache)
     demos = transitions(multi_step(episodes)[episodes["mask"]], demonstration=True)
-    buffer = TensorDictReplayBuffer(storage=LazyTensorStorage(config.buffer_size))
+    on_disk = config.buffer_on_disk
+    storage = DiskStorage(config.buffer_size, folder / "buffer") if on_disk else LazyTensorStorage(config.buffer_size)
+    buffer = TensorDictReplayBuffer(storage=storage)
 
     env.set_seed(config.seed)  # VMAS has one random state for all environments: seed after the last is built
     noise = AdditiveGaussianModule(env.action_spec, config.warmup_noise, config.warmup_noise, action_key=ACTION)

@@ -14,6 +14,7 @@ from torchrl.data import ReplayBuffer
 from torchrl.envs import EnvBase
 from vmas.simulator.environment import Environment
 
+from redig.disk_storage import DiskStorage
 from redig.files import replacing
 
 
@@ -131,7 +132,7 @@ def set_collection_state(env: EnvBase, collector: Collector, state: dict[str, An
 
 
 def buffer_state(buffer: ReplayBuffer) -> dict[str, Any]:
-    """The filled part of a buffer and its write cursor.
+    """The filled part of a buffer and its write cursor; of a :class:`~redig.disk_storage.DiskStorage` only its state.
 
     Examples:
         >>> from torchrl.data import LazyTensorStorage, TensorDictReplayBuffer
@@ -140,6 +141,8 @@ def buffer_state(buffer: ReplayBuffer) -> dict[str, Any]:
         >>> buffer_state(buffer)["data"]["reward"]
         tensor([0., 1., 2.])
     """
+    if isinstance(buffer.storage, DiskStorage):
+        return {"storage": buffer.storage.state_dict(), "writer": buffer.writer.state_dict()}
     if len(buffer) == 0:
         return {"size": 0}
     return {"size": len(buffer), "data": flat(buffer[:]), "writer": buffer.writer.state_dict()}
@@ -156,7 +159,10 @@ def set_buffer_state(buffer: ReplayBuffer, state: dict[str, Any]) -> None:
         >>> empty[:]["reward"]
         tensor([0., 1., 2.])
     """
-    if state["size"]:
+    if isinstance(buffer.storage, DiskStorage):
+        buffer.storage.load_state_dict(state["storage"])
+        buffer.writer.load_state_dict(state["writer"])
+    elif state["size"]:
         buffer.extend(unflat(state["data"], [state["size"]]))
         buffer.writer.load_state_dict(state["writer"])
 

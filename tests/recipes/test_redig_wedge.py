@@ -16,6 +16,7 @@ from PIL import Image
 from run import Run
 
 from redig.checkpoint import load_checkpoint
+from redig.disk_storage import DiskStorage
 from redig.policy import load_policy
 
 METRICS = [
@@ -103,6 +104,28 @@ def test_a_killed_run_resumes_to_the_same_result(smoke, tmp_path):
     assert done.returncode == 0, done.stderr
     assert_same_run(whole, folder)
     assert (folder / "metrics.json").read_text() == (whole / "metrics.json").read_text()
+
+
+def test_a_buffer_on_disk_changes_nothing_not_even_in_a_run_killed_after_it_has_wrapped(tmp_path, monkeypatch):
+    class PowerCut(Exception):
+        pass
+
+    def cut(storage, cursor, data, **options):
+        write(storage, cursor, data, **options)
+        if storage._writes == 3:  # the last one of all, over entries that the checkpoint before it knows
+            raise PowerCut
+
+    torch.set_num_threads(1)
+    monkeypatch.setattr(redig_wedge, "finish", lambda run, config: {})
+    write, options = DiskStorage.set, {"smoke": True, "threads": 1, "buffer_size": 200}
+    redig_wedge.train(Config(out=tmp_path / "in_memory", **options))
+    with monkeypatch.context() as patch:
+        patch.setattr(DiskStorage, "set", cut)
+        with pytest.raises(PowerCut):
+            redig_wedge.train(Config(out=tmp_path / "on_disk", buffer_on_disk=True, **options))
+    assert load_checkpoint(tmp_path / "on_disk" / "checkpoint.pt")["counters"]["online"] == 1
+    redig_wedge.train(Config(resume=tmp_path / "on_disk"))
+    assert_same_run(tmp_path / "in_memory", tmp_path / "on_disk")
 
 
 def test_another_seed_gives_another_policy(smoke, tmp_path, monkeypatch):
