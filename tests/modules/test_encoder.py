@@ -5,7 +5,7 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from redig.modules import GraphEncoder, radius_adjacency
+from redig.modules import GraphEncoder, radius_edges
 from redig.modules.encoder import AGGREGATIONS
 
 VARIANTS = [("linear", "sum"), *(("edgeconv", aggregation) for aggregation in AGGREGATIONS)]
@@ -24,11 +24,6 @@ def teams(n, seed, batch=(3,), spread=2.0):
     state = torch.randn(*batch, n, 5, dtype=torch.float64, generator=generator)
     state[..., :2] *= spread
     return state
-
-
-def edges(position, radius):
-    """``[2, E]``, from neighbour to robot, of one team."""
-    return radius_adjacency(position, radius).nonzero().flip(-1).T
 
 
 def plain_loop(encoder, state):
@@ -78,9 +73,8 @@ def test_embeddings_and_message_norms_equal_a_plain_loop(kind, aggregation, n, s
 @given(n=sizes, seed=seeds)
 def test_dense_equals_sparse(kind, aggregation, n, seed):
     encoder, state = make(kind, aggregation), teams(n, seed)
-    index = torch.cat([edges(state[b, :, :2], 2.0) + b * n for b in range(3)], -1)
-    sparse = encoder.forward_sparse(state.flatten(0, 1), index)
-    torch.testing.assert_close(encoder(state).flatten(0, 1), sparse, atol=1e-5, rtol=0)
+    sparse = encoder.forward_sparse(state.flatten(0, 1), radius_edges(state[..., :2], 2.0))
+    torch.testing.assert_close(encoder(state).flatten(0, 1), sparse, atol=1e-10, rtol=0)
 
 
 @variants
@@ -113,32 +107,6 @@ def test_linear_kind_is_the_graph_laplacian(n, seed):
     lifted = state @ encoder.lift.weight.T
     expected = (torch.eye(n, dtype=torch.float64) - laplacian) @ lifted @ encoder.out.weight.T
     torch.testing.assert_close(encoder(state), expected)
-
-
-@settings(deadline=None)
-@given(n=sizes, seed=seeds, radius=st.floats(0.1, 5))
-def test_adjacency_equals_a_double_loop(n, seed, radius):
-    position = teams(n, seed, batch=())[:, :2]
-    adjacency = radius_adjacency(position, radius)
-    for i in range(n):
-        for j in range(n):
-            assert adjacency[i, j] == (i != j and math.dist(position[i].tolist(), position[j].tolist()) <= radius)
-
-
-def test_adjacency_includes_the_radius_itself():
-    position = torch.tensor([[0.0, 0.0], [2.0, 0.0], [4.5, 0.0]])
-    assert radius_adjacency(position, 2.0).tolist() == [[False, True, False], [True, False, False], [False] * 3]
-
-
-@pytest.mark.parametrize("n", [5, 40])
-def test_adjacency_does_not_depend_on_where_the_team_is(n):
-    line = torch.stack(
-        [torch.arange(n) * 1.0, torch.zeros(n)], -1
-    )  # 2 m reaches the second neighbour, 1.99 m the first
-    expected = (torch.arange(n)[:, None] - torch.arange(n)).abs()
-    for centre in (0.0, 500.3):
-        assert torch.equal(radius_adjacency(line + centre, 1.99), expected == 1)
-        assert torch.equal(radius_adjacency(line + centre, 2.01), (expected == 1) | (expected == 2))
 
 
 @variants
@@ -222,6 +190,7 @@ def test_gradient_reaches_all_weights_and_stays_finite(kind, aggregation):
         ({"activation": None}, "activation: got None"),
         ({"radius": 0.0}, "radius: got 0.0, must be greater than 0 m"),
         ({"radius": math.nan}, "radius: got nan"),
+        ({"sparse_above": -1}, "sparse_above: got -1, must be at least 0 or None"),
     ],
 )
 def test_bad_arguments(arguments, message):

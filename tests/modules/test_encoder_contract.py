@@ -6,7 +6,7 @@ from tensordict import TensorDict
 from tensordict.nn import TensorDictModule
 from torchrl.testing import get_default_devices
 
-from redig.modules import GraphEncoder, radius_adjacency
+from redig.modules import GraphEncoder, radius_edges
 from redig.modules.encoder import AGGREGATIONS
 
 VARIANTS = [("linear", "sum"), *(("edgeconv", aggregation) for aggregation in AGGREGATIONS)]
@@ -26,11 +26,6 @@ def teams(n, seed, batch=(3,), spread=2.0):
     return state
 
 
-def edges(position, radius):
-    """``[2, E]``, from neighbour to robot, of one team."""
-    return radius_adjacency(position, radius).nonzero().flip(-1).T
-
-
 @variants
 @pytest.mark.parametrize("dtype", [torch.float16, torch.bfloat16])
 def test_half_precision_does_not_blur_positions(kind, aggregation, dtype):
@@ -46,14 +41,8 @@ def test_half_precision_does_not_blur_positions(kind, aggregation, dtype):
     torch.testing.assert_close(found.float(), expected, atol=0.15, rtol=0.05)
     torch.testing.assert_close(half.message_norms(state, position).float(), norms, atol=0.15, rtol=0.05)
     assert torch.equal(half.message_norms(state, position) > 0, norms > 0)
-    sparse = half.forward_sparse(state[0], edges(position[0], 2.0), position[0])
+    sparse = half.forward_sparse(state[0], radius_edges(position[0], 2.0), position[0])
     torch.testing.assert_close(sparse.float(), expected[0], atol=0.15, rtol=0.05)
-
-
-@pytest.mark.parametrize("dtype", [torch.float16, torch.bfloat16])
-def test_adjacency_of_positions_in_half_precision(dtype):
-    position = torch.tensor([[0.0, 0.0], [1.0, 0.0], [3.5, 0.0]], dtype=dtype)
-    assert torch.equal(radius_adjacency(position, 2.0), radius_adjacency(position.float(), 2.0))
 
 
 @variants
@@ -125,10 +114,8 @@ def test_shapes_that_do_not_fit(observation, position, message):
             call(torch.zeros(observation), position)
 
 
-def test_ranks_of_the_sparse_form_and_of_positions():
+def test_ranks_of_the_sparse_form():
     with pytest.raises(ValueError, match=r"got shapes \[2, 3, 5\] and \[2, 4\], expected \[N, 5\] and \[2, E\]"):
         make().forward_sparse(torch.zeros(2, 3, 5), torch.zeros(2, 4, dtype=torch.long))
     with pytest.raises(ValueError, match=r"got shapes \[3, 5\] and \[4, 2\], expected \[N, 5\] and \[2, E\]"):
         make().forward_sparse(torch.zeros(3, 5), torch.zeros(4, 2, dtype=torch.long))
-    with pytest.raises(ValueError, match=r"position: got shape \[2\], expected \[\*B, n, 2\]"):
-        radius_adjacency(torch.zeros(2), 1.0)

@@ -4,7 +4,8 @@ from redig.modules.actor import DiffusionActor
 from redig.modules.best_of import BestOfN
 from redig.modules.critic import QNetwork
 from redig.modules.denoiser import DenoisingMLP
-from redig.modules.encoder import GraphEncoder, radius_adjacency
+from redig.modules.encoder import GraphEncoder
+from redig.modules.neighbours import radius_adjacency, radius_edges
 from redig.modules.samplers import DDIM, DDPM, DPMSolver, Sampler
 from redig.modules.schedule import NoiseSchedule
 
@@ -20,4 +21,5 @@ __all__ = [
     "QNetwork",
     "Sampler",
     "radius_adjacency",
+    "radius_edges",
 ]

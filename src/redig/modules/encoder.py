@@ -4,57 +4,13 @@ from __future__ import annotations
 
 import torch
 from torch import Tensor, nn
-from torch_geometric.nn import MessagePassing
+from torch_geometric.utils import scatter
 
 from redig.modules.denoiser import ACTIVATIONS
+from redig.modules.neighbours import at_least_float32, radius_edges, within
 
 KINDS = ("edgeconv", "linear")
 AGGREGATIONS = ("max", "sum", "mean")
-
-
-def radius_adjacency(position: Tensor, radius: float) -> Tensor:
-    """Which robots hear each other, without self-loops: ``[*B, n, 2]`` (m) to a boolean ``[*B, n, n]``.
-
-    Distances are taken in float32 or better.
-
-    Raises:
-        ValueError: if ``position`` has another rank.
-
-    Examples:
-        >>> import torch
-        >>> radius_adjacency(torch.tensor([[0.0, 0.0], [1.0, 0.0], [9.0, 0.0]]), 2.0).sum().item()
-        2
-    """
-    if position.ndim < 2:
-        raise ValueError(f"position: got shape {list(position.shape)}, expected [*B, n, 2]")
-    position = _at_least_float32(position)
-    # the matrix product that cdist prefers for many points loses digits far from the origin
-    near = torch.cdist(position, position, compute_mode="donot_use_mm_for_euclid_dist") <= radius
-    return near & ~torch.eye(position.shape[-2], dtype=torch.bool, device=position.device)
-
-
-def _at_least_float32(position: Tensor) -> Tensor:
-    return position.to(torch.promote_types(position.dtype, torch.float32))
-
-
-class _EdgeMessages(MessagePassing):
-    """Messages along ``edge_index`` (PyG's convention: from ``edge_index[0]`` to ``edge_index[1]``), aggregated."""
-
-    def __init__(self, encoder: GraphEncoder) -> None:
-        super().__init__(aggr=encoder.aggregation)
-        self.message_of = encoder.message
-
-    def forward(self, z: Tensor, position: Tensor, edge_index: Tensor) -> Tensor:
-        """Aggregate the messages that arrive at each robot: ``[N, H]``."""
-        return self.propagate(edge_index, z=z, position=position, size=(z.shape[0], z.shape[0]))
-
-    def message(self, z_i: Tensor, z_j: Tensor, position_i: Tensor, position_j: Tensor) -> Tensor:
-        """Message from j to i."""
-        return self.message_of(
-            z_i,
-            z_j,
-            position_j - position_i,
-        )
 
 
 class GraphEncoder(nn.Module):
@@ -71,6 +27,12 @@ class GraphEncoder(nn.Module):
     Works for any number of robots; one without neighbours gets an aggregate of zero. Equivariant under permutations.
     States are cast to the type of the network; positions are not, so that bfloat16 weights do not blur distances.
 
+    Small teams are computed densely, all pairs at once, in time and memory of order n² a team; larger ones along the
+    edges of :func:`~redig.modules.radius_edges` only, in proportion to n while a robot's number of neighbours stays the
+    same. Both give the same embeddings and gradients. The dense form is one graph for ``torch.compile(fullgraph=True)``
+    and ``torch.export``; the edges depend on the data, so ``torch.compile`` breaks the graph there
+    (``sparse_above=None`` avoids it), and ``torch.export`` takes the dense form for all sizes.
+
     Args:
         in_features: width of a robot's state (7 in the paper, 9 with the direction to the nearest obstacle).
         embedding_dim: width of ``h``.
@@ -79,15 +41,20 @@ class GraphEncoder(nn.Module):
         kind: ``"edgeconv"`` or ``"linear"``.
         aggregation: ``"max"``, ``"sum"`` or ``"mean"`` over neighbours; the linear kind always sums.
         activation: name of the nonlinearity (Table 3: ReLU), or ``None`` with the linear kind.
+        sparse_above: teams of more robots than this are computed along their edges; ``None``: never. The default is
+            where that starts to pay at about four neighbours a robot (``benchmarks/team_size.py``).
 
     Raises:
-        ValueError: for an unknown kind, aggregation or activation, or a radius that is not positive.
+        ValueError: for an unknown kind, aggregation or activation, a radius that is not positive, or a negative
+            ``sparse_above``.
 
     Examples:
         >>> import torch
         >>> encoder = GraphEncoder(in_features=9)
         >>> encoder(torch.randn(32, 5, 9)).shape  # 32 teams of five robots
         torch.Size([32, 5, 64])
+        >>> encoder(30 * torch.randn(1, 1000, 9)).shape  # a thousand: along the edges
+        torch.Size([1, 1000, 64])
     """
 
     def __init__(
@@ -99,6 +66,7 @@ class GraphEncoder(nn.Module):
         kind: str = "edgeconv",
         aggregation: str = "max",
         activation: str | None = "relu",
+        sparse_above: int | None = 16,
     ) -> None:
         super().__init__()
         for name, value, allowed in (
@@ -110,12 +78,18 @@ class GraphEncoder(nn.Module):
                 raise ValueError(f"{name}: got {value!r}, allowed are {', '.join(map(str, allowed))}")
         if not radius > 0:
             raise ValueError(f"radius: got {radius}, must be greater than 0 m")
+        if sparse_above is not None and sparse_above < 0:
+            raise ValueError(f"sparse_above: got {sparse_above}, must be at least 0 or None")
         self.in_features = in_features
         self.embedding_dim = embedding_dim
         self.radius = radius
+        self.sparse_above = sparse_above
         self.kind = kind
         self.aggregation = "sum" if kind == "linear" else aggregation
-        self.act = ACTIVATIONS[activation]() if activation is not None else nn.Identity()
+        if activation == "relu":
+            self.act: nn.Module = nn.ReLU(inplace=True)  # what it acts on is never needed again
+        else:
+            self.act = ACTIVATIONS[activation]() if activation is not None else nn.Identity()
         edge = kind == "edgeconv"
         self.lift = nn.Linear(in_features, embedding_dim, bias=edge)  # W^z
         if edge:
@@ -127,17 +101,8 @@ class GraphEncoder(nn.Module):
         else:
             self.out = nn.Linear(embedding_dim, embedding_dim, bias=False)  # W^h
 
-    def message(self, z_i: Tensor, z_j: Tensor, offset: Tensor) -> Tensor:
-        """Message from neighbour j to robot i: ``[..., H]`` from their states and ``p_j - p_i`` (m)."""
-        if self.kind == "linear":
-            return self.out(z_j - z_i)
-        edge = torch.cat([offset, offset.norm(dim=-1, keepdim=True)], -1).to(z_i.dtype)
-        return self.message_out(
-            self.act(self.message_self(z_i) + self.message_mate(z_j - z_i) + self.message_edge(edge))
-        )
-
     def forward(self, observation: Tensor, position: Tensor | None = None) -> Tensor:
-        """Embed all robots of batched teams; the fast form, all pairs at once.
+        """Embed all robots of batched teams.
 
         Args:
             observation: ``[*B, n, F]``.
@@ -151,8 +116,13 @@ class GraphEncoder(nn.Module):
             ValueError: if the shapes do not fit each other or the network.
         """
         z, position = self._lift(observation, position)
-        messages = self._pairwise_messages(z, position)
-        near = radius_adjacency(position, self.radius).unsqueeze(-1)
+        # asked in this order, an export sets no limit to the number of robots
+        dense = torch.compiler.is_exporting() or self.sparse_above is None or z.shape[-2] <= self.sparse_above
+        if not dense:
+            edge_index = radius_edges(position, self.radius)
+            return self._along_edges(z.flatten(0, -2), position.flatten(0, -2), edge_index).reshape(z.shape)
+        messages, near = self._pairwise_messages(z, position)
+        near = near.unsqueeze(-1)
         if self.aggregation == "max":
             lowest = torch.finfo(messages.dtype).min
             aggregate = messages.masked_fill(~near, lowest).amax(-2)
@@ -164,7 +134,7 @@ class GraphEncoder(nn.Module):
         return self._update(z, aggregate)
 
     def forward_sparse(self, observation: Tensor, edge_index: Tensor, position: Tensor | None = None) -> Tensor:
-        """The same through PyG message passing; better for large teams with few neighbours each.
+        """The same along given edges, for a graph that is not that of the radius, such as one with messages lost.
 
         Args:
             observation: ``[N, F]``, all robots of all teams.
@@ -181,12 +151,15 @@ class GraphEncoder(nn.Module):
             seen = f"{list(observation.shape)} and {list(edge_index.shape)}"
             raise ValueError(f"observation, edge_index: got shapes {seen}, expected [N, {self.in_features}] and [2, E]")
         z, position = self._lift(observation, position)
-        return self._update(z, _EdgeMessages(self)(z, position, edge_index))
+        return self._along_edges(z, position, edge_index)
 
     def message_norms(self, observation: Tensor, position: Tensor | None = None) -> Tensor:
         """Importance of each message as in Fig. 6: ``[*B, n, n]``, the norm of what i hears from j; 0 out of range."""
         z, position = self._lift(observation, position)
-        return self._pairwise_messages(z, position).norm(dim=-1) * radius_adjacency(position, self.radius)
+        messages, near = self._pairwise_messages(z, position)
+        norms = messages.norm(dim=-1) * near
+        sender = _others(z.shape[-2], z.device).expand(norms.shape)
+        return norms.new_zeros(*norms.shape[:-1], z.shape[-2]).scatter(-1, sender, norms)
 
     def _lift(self, observation: Tensor, position: Tensor | None) -> tuple[Tensor, Tensor]:
         if observation.ndim < 2 or observation.shape[-1] != self.in_features:
@@ -201,21 +174,53 @@ class GraphEncoder(nn.Module):
                 f"position: got shape {list(position.shape)}, expected {expected} to go with the observation's shape "
                 f"{list(observation.shape)}"
             )
-        return self.act(self.lift(observation.to(self.lift.weight.dtype))), _at_least_float32(position)
+        return self.act(self.lift(observation.to(self.lift.weight.dtype))), at_least_float32(position)
 
-    def _pairwise_messages(self, z: Tensor, position: Tensor) -> Tensor:
-        """All messages ``[*B, n, n, H]``; the node terms of the first layer are computed once a robot, not a pair."""
-        offset = position.unsqueeze(-3) - position.unsqueeze(-2)  # [*B, i, j, 2] = p_j - p_i
+    def _node_terms(self, z: Tensor) -> tuple[Tensor, Tensor]:
+        """What a message takes from the robot that hears it and from the one that sends it, computed once a robot."""
         if self.kind == "linear":
             sent = self.out(z)
-            return sent.unsqueeze(-3) - sent.unsqueeze(-2)
+            return -sent, sent
         mate = self.message_mate(z)
-        mine = self.message_self(z) - mate
-        edge = torch.cat([offset, offset.norm(dim=-1, keepdim=True)], -1).to(z.dtype)
-        pre = mine.unsqueeze(-2) + mate.unsqueeze(-3) + self.message_edge(edge)
-        return self.message_out(self.act(pre))
+        return self.message_self(z) - mate, mate
+
+    def _message(self, mine: Tensor, mate: Tensor, offset: Tensor) -> Tensor:
+        """Messages ``[..., H]`` from node terms and ``p_j - p_i`` (m)."""
+        if self.kind == "linear":
+            return mine + mate
+        edge = torch.cat([offset, offset.norm(dim=-1, keepdim=True)], -1).to(mine.dtype)
+        # in place: with large batches, more time goes into fresh memory than into the sums
+        hidden = (mine + mate).add_(self.message_edge(edge))
+        return self.message_out(self.act(hidden))
+
+    def _pairwise_messages(self, z: Tensor, position: Tensor) -> tuple[Tensor, Tensor]:
+        """What each robot would hear from each other one, ``[*B, n, n - 1, H]``, and whether it does."""
+        n, (mine, mate) = z.shape[-2], self._node_terms(z)
+        others = _others(n, z.device)
+        offset = _rows(position, others) - position.unsqueeze(-2)  # p_j - p_i
+        near = within(offset, self.radius) if n > 1 else torch.zeros_like(offset[..., 0], dtype=torch.bool)
+        return self._message(mine.unsqueeze(-2), _rows(mate, others), offset), near
+
+    def _along_edges(self, z: Tensor, position: Tensor, edge_index: Tensor) -> Tensor:
+        """Embeddings ``[N, H]`` from messages along the edges only."""
+        mine, mate = self._node_terms(z)
+        sender, robot = edge_index
+        offset = position.index_select(0, sender) - position.index_select(0, robot)
+        messages = self._message(mine.index_select(0, robot), mate.index_select(0, sender), offset)
+        return self._update(z, scatter(messages, robot, 0, len(z), self.aggregation))
 
     def _update(self, z: Tensor, aggregate: Tensor) -> Tensor:
         if self.kind == "linear":
             return self.act(self.out(z) + aggregate)
         return self.act(self.out(torch.cat([z, aggregate], -1)))
+
+
+def _others(n: int, device: torch.device) -> Tensor:
+    """Numbers of the other robots beside each, ``[n, n - 1]``, from the next one on; a team of one has itself there."""
+    robot = torch.arange(n, device=device)
+    return (robot.unsqueeze(-1) + robot[1:]) % n if n > 1 else robot.unsqueeze(-1)
+
+
+def _rows(x: Tensor, index: Tensor) -> Tensor:
+    """Rows ``[*B, n, m, W]`` of ``[*B, n, W]`` by their numbers ``[n, m]``."""
+    return x.index_select(-2, index.flatten()).unflatten(-2, index.shape)
