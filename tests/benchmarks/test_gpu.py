@@ -48,10 +48,6 @@ def test_the_stand_in_finds_what_a_graph_cannot_capture(code):
         code(torch.ones(1))
 
 
-NOT_YET = pytest.mark.xfail(strict=True, reason="DenoisingMLP.prepare copies the steps of the chain from the host")
-
-
-@NOT_YET
 @pytest.mark.parametrize("encoder", [False, True])
 def test_nothing_in_an_action_breaks_a_capture(encoder):
     act, inputs = gpu.actor(3, encoder, "cpu"), torch.randn(5, 9 if encoder else 22)
@@ -59,7 +55,6 @@ def test_nothing_in_an_action_breaks_a_capture(encoder):
         assert act(inputs).shape == (5, 2)
 
 
-@NOT_YET
 def test_nothing_in_an_update_breaks_a_capture():
     loss = gpu.loss_of(gpu.configuration(steps=2, hidden=16))
     batch = gpu.batch_of(teams=4, robots=3, device="cpu")

@@ -169,8 +169,8 @@ class DenoisingMLP(nn.Module):
         first, rest = cast(nn.Linear, self.net[0]), list(self.net)[1:]
         dtype = weight_dtype(self.net)
         of_action, of_time, of_embedding = first.weight.split([self.action_dim, self.step_dim, self.embedding_dim], 1)
-        time = sinusoidal_embedding(torch.tensor(steps, device=embedding.device).float(), self.step_dim).to(dtype)
-        shift = dict(zip(steps, nn.functional.linear(time, of_time).unbind(0), strict=True))
+        every = torch.arange(max(steps) + 1, device=embedding.device)  # no copy from the host, for CUDA graphs
+        shift = nn.functional.linear(sinusoidal_embedding(every.float(), self.step_dim).to(dtype), of_time)
         base = nn.functional.linear(embedding.to(dtype), of_embedding, first.bias)
 
         def denoise(action: Tensor, step: int) -> Tensor:
