@@ -15,7 +15,7 @@ REWARD: dict[str, dict[str, Any]] = {
     "circle": {"formation_weight": 2.0, "arrival_bonus": 20.0},
 }
 SMOKE: dict[str, Any] = {  # the whole program in under a minute; it learns nothing
-    "num_trajectories": 100, "clone_updates": 20, "critic_updates": 10, "warmup_steps": 20, "env_steps": 40,
+    "num_trajectories": 100, "clone_updates": 20, "critic_updates": 20, "warmup_steps": 20, "env_steps": 40,
     "evaluation_interval": 20, "evaluation_starts": 8, "num_starts": 8, "num_envs": 8, "hidden": 32,
 }  # fmt: skip
 
