@@ -18,7 +18,10 @@ import redig
 ROOT = Path(__file__).parents[1]
 PAGES = [page for page in sorted((ROOT / "docs").rglob("*.md")) if "```python" in page.read_text()]
 MODULES = ["redig", *sorted(module.name for module in pkgutil.walk_packages(redig.__path__, "redig."))]
-PUBLIC = ["redig", *(f"redig.{name}" for name in ("modules", "objectives", "envs", "planning", "evaluation", "viz"))]
+PUBLIC = [
+    "redig",
+    *(f"redig.{name}" for name in ("modules", "objectives", "envs", "planning", "evaluation", "viz", "deploy")),
+]
 
 
 @pytest.fixture(scope="module")

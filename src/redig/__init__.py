@@ -1,18 +1,26 @@
-"""ReDiG, Reinforced Diffusion on Graphs: robot teams that cross narrow corridors in formation, as TorchRL modules."""
+"""ReDiG, Reinforced Diffusion on Graphs: robot teams that cross narrow corridors in formation, as TorchRL modules.
 
-from redig.envs import FormationNavigation, ObstacleMap, corridor, formation_offsets
-from redig.modules import (
-    DDIM,
-    DDPM,
-    DenoisingMLP,
-    DiffusionActor,
-    DPMSolver,
-    GraphEncoder,
-    NoiseSchedule,
-    QNetwork,
-)
-from redig.objectives import DIPOLoss, MultiStep, QWeightedLoss
-from redig.policy import PolicyConfig, build_policy, load_policy, save_policy
+Names are imported when they are first asked for, so that a robot with ``redig.deploy`` needs no torch.
+"""
+
+from importlib import import_module
+from importlib.util import find_spec
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from redig.envs import FormationNavigation, ObstacleMap, corridor, formation_offsets
+    from redig.modules import (
+        DDIM,
+        DDPM,
+        DenoisingMLP,
+        DiffusionActor,
+        DPMSolver,
+        GraphEncoder,
+        NoiseSchedule,
+        QNetwork,
+    )
+    from redig.objectives import DIPOLoss, MultiStep, QWeightedLoss
+    from redig.policy import PolicyConfig, build_policy, load_policy, save_policy
 
 __version__ = "0.1.0"
 
@@ -37,3 +45,19 @@ __all__ = [
     "load_policy",
     "save_policy",
 ]
+
+_HOMES = ("redig.modules", "redig.objectives", "redig.policy", "redig.envs")
+
+
+def __getattr__(name: str) -> Any:
+    if name in __all__:
+        for home in _HOMES:
+            if hasattr(module := import_module(home), name):
+                return getattr(module, name)
+    if not name.startswith("_") and find_spec(f"redig.{name}"):  # a submodule, as in redig.policy
+        return import_module(f"redig.{name}")
+    raise AttributeError(f"module 'redig' has no attribute {name!r}")
+
+
+def __dir__() -> list[str]:
+    return sorted({*globals(), *__all__})
