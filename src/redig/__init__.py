@@ -21,6 +21,17 @@ if TYPE_CHECKING:
     )
     from redig.objectives import DIPOLoss, MultiStep, QWeightedLoss
     from redig.policy import PolicyConfig, build_policy, load_policy, save_policy
+else:  # not for type checkers, to whom every name would exist
+
+    def __getattr__(name: str) -> Any:
+        if name in __all__:
+            for home in ("redig.modules", "redig.objectives", "redig.policy", "redig.envs"):
+                if hasattr(module := import_module(home), name):
+                    return getattr(module, name)
+        if not name.startswith("_") and find_spec(f"redig.{name}"):  # a submodule, as in redig.policy
+            return import_module(f"redig.{name}")
+        raise AttributeError(f"module 'redig' has no attribute {name!r}")
+
 
 __version__ = "0.1.0"
 
@@ -45,18 +56,6 @@ __all__ = [
     "load_policy",
     "save_policy",
 ]
-
-_HOMES = ("redig.modules", "redig.objectives", "redig.policy", "redig.envs")
-
-
-def __getattr__(name: str) -> Any:
-    if name in __all__:
-        for home in _HOMES:
-            if hasattr(module := import_module(home), name):
-                return getattr(module, name)
-    if not name.startswith("_") and find_spec(f"redig.{name}"):  # a submodule, as in redig.policy
-        return import_module(f"redig.{name}")
-    raise AttributeError(f"module 'redig' has no attribute {name!r}")
 
 
 def __dir__() -> list[str]:

@@ -15,6 +15,7 @@ from torch import nn
 from torchrl.data import Bounded
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 
+from redig import deploy
 from redig.deploy import export_policy
 from redig.deploy.chain import _translate
 from redig.envs import make_env
@@ -35,6 +36,18 @@ SMALL = PolicyConfig(
     schedule="linear",
     sampling_steps=4,
 )
+
+
+@pytest.fixture(scope="module")
+def exported(tmp_path_factory):
+    """Export a policy and load it."""
+
+    def through_a_file(policy, seed=None, **options):
+        path = tmp_path_factory.mktemp("exported") / "policy.onnx"
+        export_policy(policy, path, **options)
+        return deploy.load_policy(path, seed=seed)
+
+    return through_a_file
 
 
 class Renoise(Sampler):

@@ -89,6 +89,8 @@ def test_seeds(paths):
 def test_threads(paths):
     team = np.random.default_rng(0).standard_normal((5, 9))
     np.testing.assert_allclose(load_policy(paths[0], threads=2)(team), load_policy(paths[0])(team), atol=1e-6)
+    with pytest.raises(ValueError, match="threads: got 0, must be at least 1"):
+        load_policy(paths[0], threads=0)
 
 
 @pytest.mark.parametrize("shape", [(5, 7), (9,), (0, 9), (2, 5, 9, 1)])

@@ -6,16 +6,16 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:
     from redig.deploy.export import export_policy
     from redig.deploy.runtime import ExportedPolicy, load_policy
+else:  # as in redig/__init__.py
+
+    def __getattr__(name: str) -> Any:
+        if name not in __all__:
+            raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+        home = "export" if name == "export_policy" else "runtime"
+        return getattr(import_module(f"{__name__}.{home}"), name)
+
 
 __all__ = ["ExportedPolicy", "export_policy", "load_policy"]
-
-_MODULES = {"ExportedPolicy": "runtime", "export_policy": "export", "load_policy": "runtime"}
-
-
-def __getattr__(name: str) -> Any:
-    if name not in _MODULES:
-        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-    return getattr(import_module(f"{__name__}.{_MODULES[name]}"), name)
 
 
 def __dir__() -> list[str]:

@@ -111,7 +111,8 @@ def load_policy(path: str | Path, *, threads: int = 1, seed: int | None = None) 
 
     Raises:
         FileNotFoundError: if there is no such file.
-        ValueError: if it is not such a file, is damaged, or has weights in other files or operators of someone's own.
+        ValueError: for ``threads`` below 1; if it is not such a file, is damaged, or has weights in other files or
+            operators of someone's own.
 
     Examples:
         >>> load_policy("no/such/policy.onnx")
@@ -119,6 +120,8 @@ def load_policy(path: str | Path, *, threads: int = 1, seed: int | None = None) 
         ...
         FileNotFoundError: policy: no such file: no/such/policy.onnx
     """
+    if threads < 1:
+        raise ValueError(f"threads: got {threads}, must be at least 1")
     path = Path(path)
     if not path.is_file():
         raise FileNotFoundError(f"policy: no such file: {path}")
