@@ -43,6 +43,8 @@ class Arguments:
     """Threads of each run."""
     options: tuple[str, ...] = ()
     """Options passed on to the recipe, such as --smoke."""
+    runs: Path | None = None
+    """Keep the folders of this version's runs here; by default they are removed."""
     out: Path = Path("docs/results/speed")
     """Folder for the tables."""
 
@@ -53,7 +55,8 @@ def main(arguments: Arguments) -> list[dict[str, Any]]:
     rows, curves = [], []
     for seed in arguments.seeds:
         for name, root in checkouts.items():
-            row, curve = timed_run(root, seed, arguments.threads, arguments.options)
+            keep = arguments.runs / f"wedge-seed{seed}" if arguments.runs and root == ROOT else None
+            row, curve = timed_run(root, seed, arguments.threads, arguments.options, keep)
             rows.append({"recipe": name, "seed": seed, **row})
             curves += [{"recipe": name, "seed": seed, **evaluation} for evaluation in curve]
     targets = ", ".join(f"{name} {'≥' if least else '≤'} {value:g}" for name, (value, least) in TARGETS.items())
@@ -68,7 +71,7 @@ def main(arguments: Arguments) -> list[dict[str, Any]]:
 
 
 def timed_run(
-    root: Path, seed: int, threads: int, options: tuple[str, ...]
+    root: Path, seed: int, threads: int, options: tuple[str, ...], keep: Path | None = None
 ) -> tuple[dict[str, Any], list[dict[str, Any]]]:
     """One run in a fresh folder: the times and final figures, and all evaluations with their times."""
     folder = Path(tempfile.mkdtemp(prefix="redig-wall-clock-"))
@@ -89,6 +92,8 @@ def timed_run(
         if process.returncode:
             raise RuntimeError(f"{' '.join(command)} failed:\n{(folder / 'output.txt').read_text()[-2000:]}")
         final = json.loads((folder / "run" / "metrics.json").read_text())
+        if keep is not None:
+            shutil.copytree(folder / "run", keep)
     finally:
         shutil.rmtree(folder)
     row = {
