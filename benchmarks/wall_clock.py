@@ -9,11 +9,13 @@ from __future__ import annotations
 import csv
 import json
 import os
+import shlex
 import shutil
 import subprocess
 import sys
 import tempfile
 import time
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -41,8 +43,8 @@ class Arguments:
     """Another checkout whose recipe is timed in turn, seed by seed."""
     threads: int = 2
     """Threads of each run."""
-    options: tuple[str, ...] = ()
-    """Options passed on to the recipe, such as --smoke."""
+    options: str = ""
+    """Options passed on to the recipe, in one string: --options="--smoke"."""
     runs: Path | None = None
     """Keep the folders of this version's runs here; by default they are removed."""
     out: Path = Path("docs/results/speed")
@@ -56,7 +58,7 @@ def main(arguments: Arguments) -> list[dict[str, Any]]:
     for seed in arguments.seeds:
         for name, root in checkouts.items():
             keep = arguments.runs / f"wedge-seed{seed}" if arguments.runs and root == ROOT else None
-            row, curve = timed_run(root, seed, arguments.threads, arguments.options, keep)
+            row, curve = timed_run(root, seed, arguments.threads, shlex.split(arguments.options), keep)
             rows.append({"recipe": name, "seed": seed, **row})
             curves += [{"recipe": name, "seed": seed, **evaluation} for evaluation in curve]
     targets = ", ".join(f"{name} {'≥' if least else '≤'} {value:g}" for name, (value, least) in TARGETS.items())
@@ -71,7 +73,7 @@ def main(arguments: Arguments) -> list[dict[str, Any]]:
 
 
 def timed_run(
-    root: Path, seed: int, threads: int, options: tuple[str, ...], keep: Path | None = None
+    root: Path, seed: int, threads: int, options: Sequence[str] = (), keep: Path | None = None
 ) -> tuple[dict[str, Any], list[dict[str, Any]]]:
     """One run in a fresh folder: the times and final figures, and all evaluations with their times."""
     folder = Path(tempfile.mkdtemp(prefix="redig-wall-clock-"))

@@ -10,7 +10,7 @@ from typing import Any
 
 # What suits each formation: too much weight, and a team keeps its shape rather than arrive; the bonus hurries it on.
 REWARD: dict[str, dict[str, Any]] = {
-    "wedge": {"formation_weight": 2.5, "arrival_bonus": 20.0},
+    "wedge": {"formation_weight": 3.0, "arrival_bonus": 20.0},
     "line": {"formation_weight": 1.0, "arrival_bonus": 10.0},
     "circle": {"formation_weight": 2.0, "arrival_bonus": 20.0},
 }
@@ -98,7 +98,7 @@ class Config:
     """Steps of all teams with the cloned policy before the actor moves."""
     critic_updates: int = 2500
     """Updates of the critics alone before the actor moves."""
-    env_steps: int = 3200
+    env_steps: int = 2000
     """Steps of all teams during online training."""
     collect_steps: int = 20
     """Steps of all teams between updates."""
@@ -121,17 +121,17 @@ class Config:
     """Rate of the target networks, once a block (paper: 0.005, at each update)."""
     critic_lr: float = 5e-4
     """Learning rate of the critics (paper: 3e-4)."""
-    actor_lr: float = 3e-4
-    """Learning rate of encoder and denoiser."""
+    actor_lr: float = 6e-4
+    """Learning rate of encoder and denoiser (paper: 3e-4)."""
     final_lr: float = 0.1
     """Share of both learning rates that is left at the end; they fall linearly."""
     grad_norm: float = 2.0
     """Limit on the norm of gradients."""
     refine_steps: int = 1
     """Gradient steps on each action."""
-    refine_step_size: float = 0.3
+    refine_step_size: float = 0.4
     """Eta of the action refinement."""
-    refine_max_norm: float | None = 0.1
+    refine_max_norm: float | None = 0.125
     """Limit on how far refinement moves an action (m/s)."""
     refine_from: str = "stored"
     """Refine the stored action (DIPO) or one freshly sampled from the policy (Algorithm 1 as printed)."""
@@ -181,7 +181,7 @@ class Config:
     """Collect with the best of N sampled actions by min Q; 1: off. Evaluations are of the policy itself."""
 
     # evaluation
-    evaluation_interval: int = 400
+    evaluation_interval: int = 200
     """Steps of all teams between evaluations and checkpoints."""
     evaluation_starts: int = 128
     """Starts of an evaluation during training; the best policy is chosen on these."""
