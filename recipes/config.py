@@ -10,7 +10,7 @@ from typing import Any
 
 # What suits each formation: too much weight, and a team keeps its shape rather than arrive; the bonus hurries it on.
 REWARD: dict[str, dict[str, Any]] = {
-    "wedge": {"formation_weight": 3.0, "arrival_bonus": 20.0},
+    "wedge": {"formation_weight": 2.5, "arrival_bonus": 20.0},
     "line": {"formation_weight": 1.0, "arrival_bonus": 10.0},
     "circle": {"formation_weight": 2.0, "arrival_bonus": 20.0},
 }
@@ -159,8 +159,8 @@ class Config:
     """Communication range (m)."""
     hidden: int = 128
     """Width of the three hidden layers of denoiser and critics (paper: 256)."""
-    activation: str = "silu"
-    """Nonlinearity of the denoiser: silu, relu, tanh or the paper's mish, which costs nine times more than silu."""
+    activation: str = "mish"
+    """Nonlinearity of the denoiser: mish, silu (a ninth of its time on a CPU, but teams learn more slowly), relu, tanh."""
     layer_norm: bool = True
     """LayerNorm in the critics."""
     critic_activation: str = "relu"
