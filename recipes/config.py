@@ -160,7 +160,7 @@ class Config:
     hidden: int = 128
     """Width of the three hidden layers of denoiser and critics (paper: 256)."""
     activation: str = "mish"
-    """Nonlinearity of the denoiser: mish, silu (a ninth of its time on a CPU, but teams learn more slowly), relu, tanh."""
+    """Nonlinearity of the denoiser: mish, silu (much cheaper on a CPU, but teams learn more slowly), relu or tanh."""
     layer_norm: bool = True
     """LayerNorm in the critics."""
     critic_activation: str = "relu"
