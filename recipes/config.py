@@ -84,7 +84,7 @@ class Config:
     """Trajectories of single robots, planned without coordination."""
     planner: str = "astar"
     """astar or rrt."""
-    clone_updates: int = 3000
+    clone_updates: int = 2500
     """Updates of the diffusion loss on demonstrations before online training."""
     clone_batch: int = 128
     """Teams in a batch of cloning."""
@@ -96,7 +96,7 @@ class Config:
     """Teams simulated in parallel."""
     warmup_steps: int = 200
     """Steps of all teams with the cloned policy before the actor moves."""
-    critic_updates: int = 2500
+    critic_updates: int = 2000
     """Updates of the critics alone before the actor moves."""
     env_steps: int = 2000
     """Steps of all teams during online training."""
