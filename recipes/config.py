@@ -84,7 +84,7 @@ class Config:
     """Trajectories of single robots, planned without coordination."""
     planner: str = "astar"
     """astar or rrt."""
-    clone_updates: int = 2500
+    clone_updates: int = 3000
     """Updates of the diffusion loss on demonstrations before online training."""
     clone_batch: int = 128
     """Teams in a batch of cloning."""
@@ -96,9 +96,9 @@ class Config:
     """Teams simulated in parallel."""
     warmup_steps: int = 200
     """Steps of all teams with the cloned policy before the actor moves."""
-    critic_updates: int = 2000
+    critic_updates: int = 2500
     """Updates of the critics alone before the actor moves."""
-    env_steps: int = 2000
+    env_steps: int = 3200
     """Steps of all teams during online training."""
     collect_steps: int = 20
     """Steps of all teams between updates."""
@@ -121,17 +121,17 @@ class Config:
     """Rate of the target networks, once a block (paper: 0.005, at each update)."""
     critic_lr: float = 5e-4
     """Learning rate of the critics (paper: 3e-4)."""
-    actor_lr: float = 6e-4
-    """Learning rate of encoder and denoiser (paper: 3e-4)."""
+    actor_lr: float = 3e-4
+    """Learning rate of encoder and denoiser."""
     final_lr: float = 0.1
     """Share of both learning rates that is left at the end; they fall linearly."""
     grad_norm: float = 2.0
     """Limit on the norm of gradients."""
     refine_steps: int = 1
     """Gradient steps on each action."""
-    refine_step_size: float = 0.4
+    refine_step_size: float = 0.3
     """Eta of the action refinement."""
-    refine_max_norm: float | None = 0.125
+    refine_max_norm: float | None = 0.1
     """Limit on how far refinement moves an action (m/s)."""
     refine_from: str = "stored"
     """Refine the stored action (DIPO) or one freshly sampled from the policy (Algorithm 1 as printed)."""
