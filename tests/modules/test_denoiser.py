@@ -7,7 +7,7 @@ from hypothesis import strategies as st
 from torch import nn
 
 from redig.modules import DenoisingMLP
-from redig.modules.denoiser import mlp, sinusoidal_embedding
+from redig.modules.denoiser import mlp, quick_mish_, quick_mish_pays, sinusoidal_embedding
 
 
 @settings(deadline=None)
@@ -152,3 +152,21 @@ def test_a_prepared_chain_of_another_type():
 def test_a_prepared_chain_checks_the_embedding():
     with pytest.raises(ValueError, match=r"embedding: got shape \[3, 5\], expected \[3, 6\]"):
         DenoisingMLP(2, 6).prepare(torch.zeros(3, 5), [1])
+
+
+@settings(deadline=None, max_examples=30)
+@given(st.integers(0, 10), st.floats(0.1, 100))
+def test_quick_mish_is_mish(seed, scale):
+    x = scale * torch.randn(4096, generator=torch.Generator().manual_seed(seed))
+    expected = nn.functional.mish(x.double()).float()
+    torch.testing.assert_close(quick_mish_(x.clone()), expected, atol=1e-6, rtol=1e-6)
+
+
+def test_a_large_batch_without_gradients_has_the_same_values():
+    torch.manual_seed(0)
+    denoiser, action, embedding = DenoisingMLP(2, 6, (64, 64)), torch.randn(300, 2), torch.randn(300, 6)
+    expected = denoiser(action, torch.tensor(3), embedding)
+    with torch.no_grad():
+        assert quick_mish_pays(torch.zeros(300, 64))
+        found = denoiser.prepare(embedding, [3])(action, 3)
+    torch.testing.assert_close(found, expected, atol=1e-6, rtol=0)
