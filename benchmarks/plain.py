@@ -114,19 +114,19 @@ class PlainEncoder(nn.Module):
     def __init__(self, in_features: int = 9, embedding_dim: int = 64, hidden: int = 128, radius: float = 2.0) -> None:
         super().__init__()
         self.lift = nn.Linear(in_features, embedding_dim)
-        self.message_in = nn.Linear(2 * embedding_dim + 3, hidden)
+        self.message_in = nn.Linear(2 * embedding_dim + in_features + 1, hidden)
         self.message_out = nn.Linear(hidden, embedding_dim)
         self.out = nn.Linear(2 * embedding_dim, embedding_dim)
         self.radius = radius
 
     def forward(self, state: Tensor) -> Tensor:
         """Embeddings ``[B, n, H]`` of states ``[B, n, F]``."""
-        n, position = state.shape[-2], state[..., :2]
+        n = state.shape[-2]
         z = torch.relu(self.lift(state))
         mine = z.unsqueeze(-2).expand(*z.shape[:-1], n, z.shape[-1])
         theirs = z.unsqueeze(-3).expand_as(mine)
-        offset = position.unsqueeze(-3) - position.unsqueeze(-2)
-        distance = offset.norm(dim=-1, keepdim=True)
+        offset = state.unsqueeze(-3) - state.unsqueeze(-2)
+        distance = offset[..., :2].norm(dim=-1, keepdim=True)
         pair = torch.cat([mine, theirs - mine, offset, distance], -1)
         message = self.message_out(torch.relu(self.message_in(pair)))
         near = (distance <= self.radius) & ~torch.eye(n, dtype=torch.bool).unsqueeze(-1)

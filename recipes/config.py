@@ -155,6 +155,8 @@ class Config:
     # networks and sampling
     encoder: str = "edgeconv"
     """edgeconv, or linear as printed in the paper."""
+    edge_features: str = "state"
+    """What a message says of the difference between two robots: all of their state, or position only."""
     radius: float = 2.0
     """Communication range (m)."""
     hidden: int = 128

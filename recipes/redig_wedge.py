@@ -184,6 +184,7 @@ def policy_architecture(config: Config, observation_dim: int) -> PolicyConfig:
         radius=config.radius,
         encoder=config.encoder,
         encoder_activation="relu" if config.encoder == "edgeconv" else None,
+        edge_features=config.edge_features,
         hidden=(config.hidden,) * 3,
         activation=config.activation,
         diffusion_steps=config.diffusion_steps,

@@ -29,7 +29,7 @@ class PolicyConfig:
     Args:
         observation_dim: width of a robot's state.
         action_low, action_high: bounds of an action (m/s).
-        embedding_dim, encoder_hidden, radius, encoder, aggregation, encoder_activation: see
+        embedding_dim, encoder_hidden, radius, encoder, aggregation, encoder_activation, edge_features: see
             :class:`~redig.modules.GraphEncoder`.
         hidden, step_dim, activation: see :class:`~redig.modules.DenoisingMLP`.
         diffusion_steps, schedule: see :class:`~redig.modules.NoiseSchedule`.
@@ -50,6 +50,7 @@ class PolicyConfig:
     encoder: str = "edgeconv"
     aggregation: str = "max"
     encoder_activation: str | None = "relu"
+    edge_features: str = "state"
     hidden: tuple[int, ...] = (256, 256, 256)
     step_dim: int = 16
     activation: str = "mish"
@@ -109,6 +110,7 @@ def build_encoder(config: PolicyConfig) -> TensorDictModule:
         config.encoder,
         config.aggregation,
         config.encoder_activation,
+        config.edge_features,
     )
     return TensorDictModule(encoder, in_keys=[OBSERVATION], out_keys=[EMBEDDING])
 
@@ -198,7 +200,7 @@ def read_header(path: str | Path) -> tuple[PolicyConfig, dict[str, Any]]:
     try:
         policy, environment = json.loads(header["policy"]), json.loads(header["environment"])
         fields: dict[str, Any] = {k: tuple(v) if isinstance(v, list) else v for k, v in policy.items()}
-        return PolicyConfig(**fields), environment
+        return PolicyConfig(**{"edge_features": "position", **fields}), environment  # the first policies had no choice
     except (KeyError, TypeError, ValueError) as error:
         raise ValueError(f"policy: the header of {path} is damaged, or of another version ({error})") from error
 

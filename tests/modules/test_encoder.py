@@ -6,16 +6,16 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from redig.modules import GraphEncoder, radius_edges
-from redig.modules.encoder import AGGREGATIONS
+from redig.modules.encoder import AGGREGATIONS, EDGE_FEATURES
 
 VARIANTS = [("linear", "sum"), *(("edgeconv", aggregation) for aggregation in AGGREGATIONS)]
 variants = pytest.mark.parametrize(("kind", "aggregation"), VARIANTS)
 sizes, seeds = st.integers(1, 8), st.integers(0, 2**31)
 
 
-def make(kind="edgeconv", aggregation="max", activation="relu", seed=0):
+def make(kind="edgeconv", aggregation="max", activation="relu", seed=0, edge_features="state"):
     torch.manual_seed(seed)
-    return GraphEncoder(5, 12, 16, 2.0, kind, aggregation, activation).double()
+    return GraphEncoder(5, 12, 16, 2.0, kind, aggregation, activation, edge_features).double()
 
 
 def teams(n, seed, batch=(3,), spread=2.0):
@@ -41,7 +41,8 @@ def plain_loop(encoder, state):
             if encoder.kind == "linear":
                 message = encoder.out.weight @ (z[j] - z[i])
             else:
-                edge = torch.cat([state[j, :2] - state[i, :2], torch.tensor([distance], dtype=torch.float64)])
+                width = 2 if encoder.edge_features == "position" else 5
+                edge = torch.cat([(state[j] - state[i])[:width], torch.tensor([distance], dtype=torch.float64)])
                 hidden = encoder.message_self.weight @ z[i] + encoder.message_self.bias
                 hidden = hidden + encoder.message_mate.weight @ (z[j] - z[i]) + encoder.message_edge.weight @ edge
                 message = encoder.message_out.weight @ act(hidden) + encoder.message_out.bias
@@ -58,9 +59,9 @@ def plain_loop(encoder, state):
 
 @variants
 @settings(deadline=None)
-@given(n=sizes, seed=seeds)
-def test_embeddings_and_message_norms_equal_a_plain_loop(kind, aggregation, n, seed):
-    encoder, state = make(kind, aggregation), teams(n, seed)
+@given(n=sizes, seed=seeds, edges=st.sampled_from(EDGE_FEATURES))
+def test_embeddings_and_message_norms_equal_a_plain_loop(kind, aggregation, n, seed, edges):
+    encoder, state = make(kind, aggregation, edge_features=edges), teams(n, seed)
     embedding, norms = encoder(state), encoder.message_norms(state)
     for b in range(3):
         expected, expected_norms = plain_loop(encoder, state[b])
@@ -70,9 +71,9 @@ def test_embeddings_and_message_norms_equal_a_plain_loop(kind, aggregation, n, s
 
 @variants
 @settings(deadline=None)
-@given(n=sizes, seed=seeds)
-def test_dense_equals_sparse(kind, aggregation, n, seed):
-    encoder, state = make(kind, aggregation), teams(n, seed)
+@given(n=sizes, seed=seeds, edges=st.sampled_from(EDGE_FEATURES))
+def test_dense_equals_sparse(kind, aggregation, n, seed, edges):
+    encoder, state = make(kind, aggregation, edge_features=edges), teams(n, seed)
     sparse = encoder.forward_sparse(state.flatten(0, 1), radius_edges(state[..., :2], 2.0))
     torch.testing.assert_close(encoder(state).flatten(0, 1), sparse, atol=1e-10, rtol=0)
 
@@ -188,6 +189,7 @@ def test_gradient_reaches_all_weights_and_stays_finite(kind, aggregation):
         ({"aggregation": "min"}, "aggregation: got 'min', allowed are max, sum, mean"),
         ({"activation": "gelu"}, "activation: got 'gelu'"),
         ({"activation": None}, "activation: got None"),
+        ({"edge_features": "goal"}, "edge_features: got 'goal', allowed are state, position"),
         ({"radius": 0.0}, "radius: got 0.0, must be greater than 0 m"),
         ({"radius": math.nan}, "radius: got nan"),
         ({"sparse_above": -1}, "sparse_above: got -1, must be at least 0 or None"),

@@ -158,7 +158,8 @@ def test_policy_files_from_before_load():
         if (name, part) not in {("message_mate", "bias"), ("message_edge", "bias")}
     }
     state = teams(2, n=50, dtype=torch.float32, width=9)
-    dense = GraphEncoder(9, sparse_above=None)
+    assert encoder.edge_features == "position"
+    dense = GraphEncoder(9, edge_features="position", sparse_above=None)
     dense.load_state_dict(encoder.state_dict())
     torch.testing.assert_close(encoder(state), dense(state), atol=1e-5, rtol=1e-5)
 

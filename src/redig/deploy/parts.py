@@ -35,12 +35,13 @@ class TeamEncoder(nn.Module):
         encoder = self.encoder
         z, position = encoder.act(encoder.lift(observation)), observation[..., :2]
         number = torch.arange(observation.shape[-2], device=observation.device)
-        listening, own = (z[:, :1], position[:, :1]) if self.ego else (z, position)
-        offset = position.unsqueeze(-3) - own.unsqueeze(-2)  # [B, i, j, 2] = p_j - p_i
+        listening = slice(None, 1) if self.ego else slice(None)
+        offset = position.unsqueeze(-3) - position[:, listening].unsqueeze(-2)  # [B, i, j, 2] = p_j - p_i
         distance = offset.square().sum(-1, keepdim=True).sqrt()
-        oneself = number[: 1 if self.ego else None].unsqueeze(-1) == number
+        oneself = number[listening].unsqueeze(-1) == number
         near = (distance <= encoder.radius) & ~oneself.unsqueeze(-1)
-        messages = self._messages(listening, z, torch.cat([offset, distance], -1))
+        carried = observation if encoder.edge_features == "state" else position
+        messages = self._messages(z, carried, distance, listening)
         if encoder.aggregation == "max":
             heard = torch.where(near, messages, torch.finfo(messages.dtype).min).amax(-2)
             heard = torch.where(near.any(-2), heard, 0.0)
@@ -49,17 +50,19 @@ class TeamEncoder(nn.Module):
             if encoder.aggregation == "mean":
                 heard = heard / near.sum(-2).clamp_min(1)
         if encoder.kind == "linear":
-            return encoder.act(encoder.out(listening) + heard)
-        return encoder.act(encoder.out(torch.cat([listening, heard], -1)))
+            return encoder.act(encoder.out(z[:, listening]) + heard)
+        return encoder.act(encoder.out(torch.cat([z[:, listening], heard], -1)))
 
-    def _messages(self, listening: Tensor, z: Tensor, edge: Tensor) -> Tensor:
+    def _messages(self, z: Tensor, carried: Tensor, distance: Tensor, listening: slice) -> Tensor:
         """What each listening robot would hear from each robot of its team: ``[B, i, j, H]``."""
         encoder = self.encoder
         if encoder.kind == "linear":
-            return encoder.out(z).unsqueeze(-3) - encoder.out(listening).unsqueeze(-2)
-        mate = encoder.message_mate(z)
-        mine = encoder.message_self(listening) - encoder.message_mate(listening)
-        hidden = mine.unsqueeze(-2) + mate.unsqueeze(-3) + encoder.message_edge(edge)
+            sent = encoder.out(z)
+            return sent.unsqueeze(-3) - sent[:, listening].unsqueeze(-2)
+        edge = encoder.message_edge.weight
+        mate = encoder.message_mate(z) + carried @ edge[:, :-1].T
+        mine = encoder.message_self(z[:, listening]) - mate[:, listening]
+        hidden = mine.unsqueeze(-2) + mate.unsqueeze(-3) + distance * edge[:, -1]
         return encoder.message_out(encoder.act(hidden))
 
 
