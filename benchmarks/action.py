@@ -118,7 +118,7 @@ def trained_actor(hidden: int, updates: int = 300) -> DiffusionActor:
     with torch.enable_grad():
         for _ in range(updates):
             embedding = torch.randn(256, EMBEDDING_DIM)
-            error = actor.module.denoising_error(0.8 * embedding[:, :ACTION_DIM].tanh(), embedding).mean()
+            error = actor.module.action_loss(0.8 * embedding[:, :ACTION_DIM].tanh(), embedding).mean()
             optimizer.zero_grad()
             error.backward()
             optimizer.step()

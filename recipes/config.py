@@ -153,6 +153,8 @@ class Config:
     """Keep the critics' loss from a shared encoder."""
 
     # networks and sampling
+    actor: str = "diffusion"
+    """diffusion; or gaussian or deterministic, trained in exactly the same way, to compare with."""
     encoder: str = "edgeconv"
     """edgeconv, or linear as printed in the paper."""
     edge_features: str = "state"

@@ -193,6 +193,7 @@ def policy_architecture(config: Config, observation_dim: int) -> PolicyConfig:
         noise_ratio=config.noise_ratio,
         sampler=config.sampler,
         eta=config.eta,
+        kind=config.actor,
     )
 
 

@@ -14,12 +14,24 @@ from tensordict.nn import TensorDictModule, TensorDictSequential
 from torchrl.data import Bounded
 
 from redig.files import replacing
-from redig.modules import DDIM, DDPM, DenoisingMLP, DiffusionActor, DPMSolver, GraphEncoder, NoiseSchedule, Sampler
+from redig.modules import (
+    DDIM,
+    DDPM,
+    DenoisingMLP,
+    DiffusionActor,
+    DPMSolver,
+    GaussianActor,
+    GraphEncoder,
+    NoiseSchedule,
+    Sampler,
+)
+from redig.modules.denoiser import mlp
 
 FORMAT = "redig-policy-1"
 OBSERVATION, EMBEDDING, ACTION = ("agents", "observation"), ("agents", "embedding"), ("agents", "action")
 LATENT = ("agents", "latent")
 SAMPLERS = ("ddpm", "ddim", "dpmsolver")
+KINDS = ("diffusion", "gaussian", "deterministic")
 
 
 @dataclass(frozen=True)
@@ -34,6 +46,8 @@ class PolicyConfig:
         hidden, step_dim, activation: see :class:`~redig.modules.DenoisingMLP`.
         diffusion_steps, schedule: see :class:`~redig.modules.NoiseSchedule`.
         sampling_steps, noise_ratio, early_stop, sampler, eta: see :func:`build_sampler`.
+        kind: ``"diffusion"``; ``"gaussian"`` or ``"deterministic"`` for a :class:`~redig.modules.GaussianActor` of the
+            same width, which needs none of what concerns steps, schedule and sampler.
 
     Examples:
         >>> config = PolicyConfig(observation_dim=9, sampling_steps=5)
@@ -61,6 +75,7 @@ class PolicyConfig:
     early_stop: int | None = None
     sampler: str = "ddpm"
     eta: float = 0.0
+    kind: str = "diffusion"
 
 
 def build_sampler(
@@ -118,13 +133,16 @@ def build_encoder(config: PolicyConfig) -> TensorDictModule:
 def build_policy(
     config: PolicyConfig, *, fixed_latent: bool = False, warm_start: int | None = None
 ) -> TensorDictSequential:
-    """A new policy with random weights: graph encoder, then diffusion actor.
+    """A new policy with random weights: graph encoder, then diffusion actor, or one without diffusion.
 
     Args:
         config: the architecture.
         fixed_latent: read each robot's latent from ``("agents", "latent")`` instead of drawing one at each step.
         warm_start: step at which the chain begins with the action before, see :class:`~redig.modules.DiffusionActor`.
             For either, append the actor's ``make_tensordict_primer()`` to the environment.
+
+    Raises:
+        ValueError: for an unknown kind, or an option of the diffusion chain given to another kind.
 
     Examples:
         >>> import torch
@@ -134,10 +152,19 @@ def build_policy(
         >>> policy(team)["agents", "action"].shape
         torch.Size([1, 5, 2])
     """
+    if config.kind not in KINDS:
+        raise ValueError(f"kind: got {config.kind!r}, allowed are {', '.join(KINDS)}")
     low, high = torch.tensor(config.action_low), torch.tensor(config.action_high)
+    spec = Bounded(low, high, low.shape)
+    if config.kind != "diffusion":
+        if fixed_latent or warm_start is not None:
+            raise ValueError(f"fixed_latent, warm_start: a {config.kind} policy has no chain; leave them out")
+        stochastic = config.kind == "gaussian"
+        net = mlp(config.embedding_dim, config.hidden, len(low) * (1 + stochastic), config.activation)
+        return TensorDictSequential(build_encoder(config), GaussianActor(net, spec, [EMBEDDING], [ACTION], stochastic))
     actor = DiffusionActor(
         DenoisingMLP(len(low), config.embedding_dim, config.hidden, config.step_dim, config.activation),
-        Bounded(low, high, low.shape),
+        spec,
         in_keys=[EMBEDDING],
         out_keys=[ACTION],
         schedule=NoiseSchedule(config.diffusion_steps, config.schedule),

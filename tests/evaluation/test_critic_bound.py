@@ -46,7 +46,7 @@ class Constant(nn.Module):
     def forward(self, observation):
         return self.action.expand(*observation.shape[:-1], -1)
 
-    def denoising_error(self, action, observation):
+    def action_loss(self, action, observation):
         raise NotImplementedError
 
 

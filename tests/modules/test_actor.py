@@ -61,10 +61,10 @@ class TestRandomness:
         actors = [make(seed=seed) for seed in (3, 3, 4)]
         torch.manual_seed(11)
         before = torch.get_rng_state()
-        first = sample(actors[0], data), actors[0].module.denoising_error(torch.zeros(8, 5, 2), data["embedding"])
+        first = sample(actors[0], data), actors[0].module.action_loss(torch.zeros(8, 5, 2), data["embedding"])
         assert torch.equal(torch.get_rng_state(), before)
         torch.manual_seed(12)
-        second = sample(actors[1], data), actors[1].module.denoising_error(torch.zeros(8, 5, 2), data["embedding"])
+        second = sample(actors[1], data), actors[1].module.action_loss(torch.zeros(8, 5, 2), data["embedding"])
         assert torch.equal(first[0], second[0])
         assert torch.equal(first[1], second[1])
         assert not torch.equal(first[0], sample(actors[2], data))
@@ -148,8 +148,8 @@ class TestKeys:
         expected = sample(together, TensorDict({"embedding": both}, [8]))
         assert torch.equal(sample(apart, split), expected)
         action = torch.rand(8, 5, 2)
-        found = apart.module.denoising_error(action, both[..., :2], both[..., 2:])
-        assert torch.equal(found, together.module.denoising_error(action, both))
+        found = apart.module.action_loss(action, both[..., :2], both[..., 2:])
+        assert torch.equal(found, together.module.action_loss(action, both))
 
     def test_dispatch_of_plain_tensors(self):
         actor = make(in_keys=["first", ("a", "b", "second")], out_keys=[("a", "action")])
@@ -191,7 +191,7 @@ class TestBatches:
     def test_shapes(self, batch):
         actor, data = make(Bounded(-1, 1, (2,))), embeddings(*batch)
         assert sample(actor, data).shape == (*batch, 2)
-        assert actor.module.denoising_error(torch.zeros(*batch, 2), data["embedding"]).shape == batch
+        assert actor.module.action_loss(torch.zeros(*batch, 2), data["embedding"]).shape == batch
         rows = embeddings(data["embedding"].numel() // 6)
         rows["embedding"] = data["embedding"].reshape(-1, 6)
         torch.testing.assert_close(best(actor, data).reshape(-1, 2), best(actor, rows))
@@ -291,7 +291,7 @@ class TestPrecision:
             assert ((action >= LOW.to(device)) & (action <= HIGH.to(device))).all()
             change = actor.module.normalize(action) - actor.module.normalize(expected)
             assert change.abs().max() < 0.05
-            error = actor.module.denoising_error(action, cast["embedding"])
+            error = actor.module.action_loss(action, cast["embedding"])
             assert error.dtype == torch.float32
             error.mean().backward()
         torch.testing.assert_close(actor.float().module.low.cpu(), LOW, atol=0, rtol=0)  # nothing was rounded

@@ -71,11 +71,11 @@ def test_compiled_warm_start_and_latent():
         torch.testing.assert_close(found[key], expected[key])
 
 
-def test_compiled_denoising_error():
+def test_compiled_action_loss():
     actor, embedding, action = make(DDIM(5))[-1], torch.randn(3, 5, 6), 2 * torch.rand(3, 5, 2) - 1
-    compiled = torch.compile(actor.module.denoising_error, fullgraph=True, backend="eager")
+    compiled = torch.compile(actor.module.action_loss, fullgraph=True, backend="eager")
     torch.manual_seed(1)
-    expected = actor.module.denoising_error(action, embedding)
+    expected = actor.module.action_loss(action, embedding)
     torch.manual_seed(1)
     torch.testing.assert_close(compiled(action, embedding), expected)
 

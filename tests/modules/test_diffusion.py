@@ -129,10 +129,10 @@ def test_warm_start_out_of_range(sampler, warm_start, allowed):
             policy(torch.zeros(3, 6), torch.zeros(3, 2), sampler=sampler)
 
 
-def test_denoising_error_on_the_same_noise():
+def test_action_loss_on_the_same_noise():
     policy, embedding = make(seed=7), torch.randn(8, 5, 6)
     action = LOW + torch.rand(8, 5, 2) * (HIGH - LOW)
-    found = policy.denoising_error(action, embedding)
+    found = policy.action_loss(action, embedding)
     generator = torch.Generator().manual_seed(7)
     step = torch.randint(10, (8, 5), generator=generator)
     noise = torch.randn(8, 5, 2, generator=generator)
@@ -145,7 +145,7 @@ def test_denoising_error_on_the_same_noise():
             torch.testing.assert_close(found[b, i], ((predicted - noise[b, i]) ** 2).sum() / 2)
 
 
-def test_denoising_error_covers_every_step_and_vanishes_for_the_right_noise():
+def test_action_loss_covers_every_step_and_vanishes_for_the_right_noise():
     action, seen = LOW + torch.rand(2000, 2) * (HIGH - LOW), []
     clean = 2 * (action - LOW) / (HIGH - LOW) - 1
 
@@ -157,16 +157,16 @@ def test_denoising_error_covers_every_step_and_vanishes_for_the_right_noise():
     def silent(noisy, *_):
         return torch.zeros_like(noisy)
 
-    assert make(perfect).denoising_error(action, clean).max() < 1e-6
+    assert make(perfect).action_loss(action, clean).max() < 1e-6
     assert torch.bincount(seen[0], minlength=10).min() > 100
     assert seen[0].max() == 9
-    assert make(silent).denoising_error(action, clean).mean().item() == pytest.approx(1, abs=0.1)
+    assert make(silent).action_loss(action, clean).mean().item() == pytest.approx(1, abs=0.1)
 
 
 @pytest.mark.parametrize("shape", [(8, 5, 3), (8, 4, 2), (5, 2), (8, 5, 1)])
-def test_denoising_error_of_shapes_that_do_not_fit(shape):
+def test_action_loss_of_shapes_that_do_not_fit(shape):
     with pytest.raises(ValueError, match=r"action: got shape .*, expected \[8, 5, 2\] .* shape \[8, 5, 6\]"):
-        make().denoising_error(torch.zeros(shape), torch.zeros(8, 5, 6))
+        make().action_loss(torch.zeros(shape), torch.zeros(8, 5, 6))
 
 
 def test_learns_a_distribution_with_two_modes():
@@ -177,7 +177,7 @@ def test_learns_a_distribution_with_two_modes():
     embedding = torch.zeros(512, 1)
     for _ in range(800):
         action = torch.where(torch.rand(512, 1) < 0.3, -1.5, 0.5)
-        loss = policy.denoising_error(action, embedding).mean()
+        loss = policy.action_loss(action, embedding).mean()
         optimizer.zero_grad()
         loss.backward()
         optimizer.step()

@@ -24,7 +24,7 @@ class ConstantActor(nn.Module):
     def forward(self, embedding):
         return self.action.expand(*embedding.shape[:-1], -1)
 
-    def denoising_error(self, action, embedding):
+    def action_loss(self, action, embedding):
         return (action - self.action).square().mean(-1)
 
 

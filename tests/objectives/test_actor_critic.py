@@ -286,7 +286,7 @@ def test_keys_that_the_critic_does_not_know_are_named(name):
 def test_an_actor_without_diffusion_is_refused():
     actor = TensorDictModule(nn.Linear(4, 2), in_keys=["observation"], out_keys=["action"])
     value = TensorDictModule(QNetwork(4, 2), in_keys=["observation", "action"], out_keys=["state_action_value"])
-    with pytest.raises(TypeError, match="actor: got TensorDictModule whose module has no denoising_error, low, high"):
+    with pytest.raises(TypeError, match="actor: got TensorDictModule whose module has no action_loss, low, high"):
         DIPOLoss(None, actor, value)
 
 

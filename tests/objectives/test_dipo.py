@@ -131,14 +131,14 @@ def test_actor_learns_the_refined_action_and_the_critic_the_executed_one():
     torch.testing.assert_close(out["loss_qvalue"], plain)
 
 
-def test_actor_loss_is_the_denoising_error_of_the_actor():
+def test_actor_loss_is_the_action_loss_of_the_actor():
     loss, data = make(actor_seed=3, refine_steps=0), transitions(6)
     found = loss.actor_loss(data)[0]
     reference = make(actor_seed=3)
     with reference.encoder_network_params.to_module(reference.encoder_network):
         embedding = reference.encoder_network(data.select("observation"))["embedding"]
     with reference.actor_network_params.to_module(reference.actor_network):
-        expected = reference.actor_network.module.denoising_error(data["action"], embedding).mean()
+        expected = reference.actor_network.module.action_loss(data["action"], embedding).mean()
     torch.testing.assert_close(found, expected)
 
 

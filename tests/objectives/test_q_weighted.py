@@ -34,9 +34,9 @@ class UniformActor(ConstantActor):
         self.learned = []
         return self.drawn
 
-    def denoising_error(self, action, embedding):
+    def action_loss(self, action, embedding):
         self.learned.append(action)
-        return super().denoising_error(action, embedding)
+        return super().action_loss(action, embedding)
 
 
 def uniform_actor(action=(0.0, 0.0)):

@@ -9,10 +9,11 @@ import torch
 from tensordict import TensorDictBase, unravel_key, unravel_key_list
 from tensordict.nn import TensorDictModule, dispatch, set_skip_existing
 from tensordict.utils import NestedKey
-from torch import Tensor, nn
+from torch import nn
 from torchrl.data import Bounded, Composite, TensorSpec, Unbounded
 from torchrl.envs import Compose, TensorDictPrimer
 
+from redig.modules.bounded import action_bounds
 from redig.modules.diffusion import DiffusionPolicy
 from redig.modules.samplers import DDPM, Sampler
 from redig.modules.schedule import NoiseSchedule
@@ -89,12 +90,7 @@ class DiffusionActor(TensorDictModule):
         in_keys, out_keys = list(unravel_key_list(in_keys)), list(unravel_key_list(out_keys))
         if len(out_keys) != 1:
             raise ValueError(f"out_keys: got {out_keys}, must be one key, the action's")
-        batch_dims = 0
-        if isinstance(action_spec, Composite):
-            if out_keys[0] not in (there := action_spec.keys(True, True)):
-                raise KeyError(f"action_spec: no key {out_keys[0]!r}, the action's; it has {_names(there)}")
-            batch_dims, action_spec = len(action_spec.shape), action_spec[out_keys[0]]
-        low, high = _bounds(action_spec)
+        low, high, action_shape = action_bounds(action_spec, out_keys[0])
         schedule, sampler = schedule or NoiseSchedule(), sampler or DDPM()
         policy = DiffusionPolicy(denoiser, schedule, sampler, low, high, generator, latent_key is not None, warm_start)
         self.action_key, self.embedding_keys, self.latent_key = out_keys[0], list(in_keys), latent_key
@@ -107,7 +103,7 @@ class DiffusionActor(TensorDictModule):
             in_keys.append(self.previous_action_key)
             out_keys.append(("next", *_path(self.previous_action_key)))
         super().__init__(policy, in_keys=in_keys, out_keys=out_keys)
-        self.action_shape = action_spec.shape[batch_dims:]
+        self.action_shape = action_shape
 
     @property
     def spec(self) -> Composite:
@@ -218,17 +214,3 @@ def _names(keys: Iterable[NestedKey]) -> str:
 
 def _path(key: NestedKey) -> tuple[str, ...]:
     return (key,) if isinstance(key, str) else tuple(key)
-
-
-def _bounds(spec: TensorSpec) -> tuple[Tensor, Tensor]:
-    """Lower and upper bounds ``[A]`` of an action spec ``[*B, A]``."""
-    space = getattr(spec, "space", None)
-    low, high = getattr(space, "low", None), getattr(space, "high", None)
-    if low is None or high is None or not torch.isfinite(high - low).all():
-        raise ValueError(f"action_spec: got {type(spec).__name__} without finite bounds; use torchrl.data.Bounded")
-    if spec.ndim == 0 or not (low < high).all():
-        raise ValueError(f"action_spec: got shape {list(spec.shape)}, expected [*n, A] with low < high everywhere")
-    low, high = low.reshape(-1, low.shape[-1]), high.reshape(-1, high.shape[-1])
-    if not ((low == low[0]).all() and (high == high[0]).all()):
-        raise ValueError("action_spec: the bounds differ between robots; use one actor for each kind of robot")
-    return low[0], high[0]

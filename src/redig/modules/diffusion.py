@@ -8,11 +8,12 @@ import torch
 from torch import Tensor, nn
 from torchrl.envs.utils import ExplorationType, exploration_type
 
+from redig.modules.bounded import BoundedPolicy
 from redig.modules.samplers import Denoise, Sampler
-from redig.modules.schedule import NoiseSchedule, keep_precision
+from redig.modules.schedule import NoiseSchedule
 
 
-class DiffusionPolicy(nn.Module):
+class DiffusionPolicy(BoundedPolicy):
     """Tensors in, tensors out; :class:`~redig.modules.DiffusionActor` gives it its keys and explains the options.
 
     The chain runs in [-1, 1] and in float32 or better, whatever the type of the network; actions are scaled to the
@@ -43,9 +44,6 @@ class DiffusionPolicy(nn.Module):
         tensor([-1.,  1.])
     """
 
-    low: Tensor
-    high: Tensor
-
     def __init__(
         self,
         denoiser: nn.Module,
@@ -57,27 +55,13 @@ class DiffusionPolicy(nn.Module):
         latent: bool = False,
         warm_start: int | None = None,
     ) -> None:
-        super().__init__()
+        super().__init__(low, high)
         self.denoiser = denoiser
         self.schedule = schedule
         self.sampler = sampler
         self.generator = generator
         self.reads_latent, self.warm_start = latent, warm_start
-        self.register_buffer("low", low.clone())
-        self.register_buffer("high", high.clone())
         self.first_step(sampler)  # raises if they do not fit each other
-
-    def _apply(self, fn: Callable[[Tensor], Tensor], recurse: bool = True) -> DiffusionPolicy:
-        return keep_precision(self, super()._apply, fn, recurse)
-
-    def normalize(self, action: Tensor) -> Tensor:
-        """From the bounds of the spec to [-1, 1]."""
-        return 2 * (action - self.low) / (self.high - self.low) - 1
-
-    def denormalize(self, action: Tensor) -> Tensor:
-        """From [-1, 1] to the bounds of the spec."""
-        action = self.low + (action + 1) * (self.high - self.low) / 2
-        return action.maximum(self.low).minimum(self.high)
 
     def first_step(self, sampler: Sampler) -> int:
         """Where the chain of a sampler begins: at its noisiest step, with a warm start at the noisiest up to that one.
@@ -125,7 +109,7 @@ class DiffusionPolicy(nn.Module):
         action = sampler(denoise, latent, self.schedule, self.generator, deterministic, start)
         return self.denormalize(action) if self.warm_start is None else (self.denormalize(action), action)
 
-    def denoising_error(self, action: Tensor, *embedding: Tensor) -> Tensor:
+    def action_loss(self, action: Tensor, *embedding: Tensor) -> Tensor:
         """Squared error of the predicted noise at a random step, Eq. 1 with Eq. 9: ``[*B]``, mean over A.
 
         Args:
@@ -135,12 +119,7 @@ class DiffusionPolicy(nn.Module):
         Raises:
             ValueError: if the shapes do not fit each other.
         """
-        expected = (*embedding[0].shape[:-1], self.low.shape[-1])
-        if action.shape != expected:
-            raise ValueError(
-                f"action: got shape {list(action.shape)}, expected {list(expected)} to go with the embedding's shape "
-                f"{list(embedding[0].shape)}"
-            )
+        self.check_action(action, *embedding)
         clean = self.normalize(action)
         shape, device = clean.shape[:-1], clean.device
         step = torch.randint(self.schedule.num_steps, shape, device=device, generator=self.generator)

@@ -57,7 +57,7 @@ class DiffusionActorCriticLoss(DiffusionActorCriticNetworks):
         >>> from redig.modules import DenoisingMLP, DiffusionActor, QNetwork
         >>> class Cloning(DiffusionActorCriticLoss):
         ...     def actor_loss(self, tensordict):
-        ...         error = self._denoising_error(tensordict, tensordict[self.tensor_keys.action])
+        ...         error = self._action_loss(tensordict, tensordict[self.tensor_keys.action])
         ...         return error.mean(), {}
         >>> actor = DiffusionActor(DenoisingMLP(1, 3), Bounded(-2, 2, (1,)), ["observation"], ["action"])
         >>> qvalue = TensorDictModule(QNetwork(3, 1), ["observation", "action"], ["state_action_value"])

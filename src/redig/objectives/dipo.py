@@ -165,7 +165,7 @@ class DIPOLoss(DiffusionActorCriticLoss):
 
     def _loss_on_refined(self, tensordict: TensorDictBase, embedding: TensorDictBase) -> Tensor:
         keys = self.tensor_keys
-        error = self._denoising_error(embedding, tensordict[keys.refined_action])
+        error = self._action_loss(embedding, tensordict[keys.refined_action])
         counted = self._counted(tensordict, error, self._flag(tensordict, keys.actor_mask, error))
         return self._reduce(error, tensordict, counted)
 

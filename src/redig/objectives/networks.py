@@ -14,7 +14,7 @@ from torchrl.envs.utils import ExplorationType, set_exploration_type
 from torchrl.objectives import LossModule
 from torchrl.objectives.utils import _vmap_func
 
-from redig.modules.diffusion import DiffusionPolicy
+from redig.modules.bounded import BoundedPolicy
 from redig.modules.schedule import NoiseSchedule
 from redig.objectives.batches import HALF, at_least_float32
 
@@ -58,7 +58,7 @@ class DiffusionActorCriticNetworks(LossModule):
         deactivate_vmap: bool,
     ) -> None:
         policy = getattr(actor, "module", None)
-        missing = [name for name in ("denoising_error", "low", "high") if not hasattr(policy, name)]
+        missing = [name for name in ("action_loss", "low", "high") if not hasattr(policy, name)]
         if missing:
             raise TypeError(
                 f"actor: got {type(actor).__name__} whose module has no {', '.join(missing)}; give a DiffusionActor"
@@ -98,7 +98,7 @@ class DiffusionActorCriticNetworks(LossModule):
         names = [
             f"{path}.{name}"
             for path, module in self.actor_network.named_modules()
-            if isinstance(module, (DiffusionPolicy, NoiseSchedule))
+            if isinstance(module, (BoundedPolicy, NoiseSchedule))
             for name in module._buffers
         ]
         for params in (self._modules["actor_network_params"], self._modules["target_actor_network_params"]):
@@ -135,11 +135,11 @@ class DiffusionActorCriticNetworks(LossModule):
         name = "critic_encoder_network" if self.separate_encoders else "encoder_network"
         return self._embed(tensordict, name, target)
 
-    def _denoising_error(self, embedding: TensorDictBase, action: Tensor) -> Tensor:
+    def _action_loss(self, embedding: TensorDictBase, action: Tensor) -> Tensor:
         """Diffusion loss of the actor on given actions (Eq. 1): ``[*B, n, 1]``."""
         keys = getattr(self.actor_network, "embedding_keys", self.actor_network.in_keys)
         with self.actor_network_params.to_module(self.actor_network, preserve_module_state=False):
-            return self.actor_network.module.denoising_error(action, *(embedding[key] for key in keys)).unsqueeze(-1)
+            return self.actor_network.module.action_loss(action, *(embedding[key] for key in keys)).unsqueeze(-1)
 
     @torch.no_grad()
     def _sample_action(self, embedding: TensorDictBase, params: TensorDictParams) -> Tensor:

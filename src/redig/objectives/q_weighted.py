@@ -110,7 +110,7 @@ class QWeightedLoss(DiffusionActorCriticLoss):
         error = (weight.where(~demonstration, 1 / len(weight)) * self._error_of_many(embedding, candidates)).sum(0)
         if self.weighting == "advantage" and self.entropy_weight > 0:
             own = self.entropy_weight * weight[0].where(~demonstration, 0)
-            error = error + own * self._denoising_error(embedding, self._uniform(executed))
+            error = error + own * self._action_loss(embedding, self._uniform(executed))
         return self._reduce(error, tensordict, counted), {"candidate_gap": advantage.amax(0).mean()}
 
     def _weigh(self, candidates: Tensor, advantage: Tensor, counted: Tensor) -> tuple[Tensor, Tensor]:
@@ -136,7 +136,7 @@ class QWeightedLoss(DiffusionActorCriticLoss):
         return actions, self._qvalues(critic_view.expand(many), actions, self.qvalue_network_params).amin(0)
 
     def _error_of_many(self, embedding: TensorDictBase, action: Tensor) -> Tensor:
-        return self._denoising_error(embedding.expand(len(action), *embedding.shape), action)
+        return self._action_loss(embedding.expand(len(action), *embedding.shape), action)
 
     def _uniform(self, action: Tensor) -> Tensor:
         low, high = self._bounds
