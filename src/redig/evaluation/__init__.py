@@ -16,7 +16,7 @@ from redig.evaluation.diffusion_bound import (
     prior_mismatch,
     prior_mismatch_floor,
 )
-from redig.evaluation.evaluate import evaluate, rollout_trajectories
+from redig.evaluation.evaluate import evaluate, evaluate_teams, rollout_trajectories
 from redig.evaluation.metrics import (
     contextual_formation_integrity,
     gap_term,
@@ -37,6 +37,7 @@ __all__ = [
     "discretization_error",
     "discretization_term",
     "evaluate",
+    "evaluate_teams",
     "format_table",
     "gap_term",
     "jerk",

@@ -115,6 +115,45 @@ def evaluate(
         >>> metrics["success_rate"], metrics["num_starts"]  # in so wide a corridor, straight on is good enough
         (1.0, 4.0)
     """
+    teams = evaluate_teams(policy, env, seed, num_starts, max_steps, deltas, exploration_type)
+    metrics = {key: value.nanmean().item() for key, value in teams.items()}
+    return {**metrics, "num_starts": float(len(teams["success_rate"]))}
+
+
+def evaluate_teams(
+    policy: TensorDictModuleBase,
+    env: EnvBase,
+    seed: int,
+    num_starts: int | None = None,
+    max_steps: int | None = None,
+    deltas: Sequence[float] = (0.5, 0.1, 0.03),
+    exploration_type: ExplorationType = ExplorationType.DETERMINISTIC,
+) -> dict[str, Tensor]:
+    """The metrics of :func:`evaluate` for each start, ``[num_starts]``: what intervals are computed from.
+
+    ``travel_time`` is NaN for a team of which not every robot arrives.
+
+    Args:
+        policy: see :func:`evaluate`, as the other arguments.
+        env: see there.
+        seed: see there.
+        num_starts: see there.
+        max_steps: see there.
+        deltas: see there.
+        exploration_type: see there.
+
+    Raises:
+        ValueError: see there.
+
+    Examples:
+        >>> from tensordict.nn import TensorDictModule
+        >>> from redig.envs import make_env
+        >>> observation, action = ("agents", "observation"), ("agents", "action")
+        >>> straight = TensorDictModule(lambda state: state[..., 4:6].clamp(-1, 1), [observation], [action])
+        >>> teams = evaluate_teams(straight, make_env(4, formation="line", corridor_width=4.0), seed=0, num_starts=3)
+        >>> teams["team_success_rate"]
+        tensor([1., 1., 1.])
+    """
     num_envs = env.batch_size[0]
     num_starts = num_envs if num_starts is None else num_starts
     if num_starts < 1:
@@ -125,8 +164,7 @@ def evaluate(
         trajectories = rollout_trajectories(policy, env, seed + run, max_steps, exploration_type)
         for key, value in _team_metrics(trajectories, scenario, deltas).items():
             teams.setdefault(key, []).append(value)
-    metrics = {key: torch.cat(values)[:num_starts].nanmean().item() for key, values in teams.items()}
-    return {**metrics, "num_starts": float(num_starts)}
+    return {key: torch.cat(values)[:num_starts] for key, values in teams.items()}
 
 
 def _team_metrics(

@@ -128,9 +128,8 @@ class GraphEncoder(nn.Module):
         # asked in this order, an export sets no limit to the number of robots
         dense = torch.compiler.is_exporting() or self.sparse_above is None or z.shape[-2] <= self.sparse_above
         if not dense:
-            edge_index = radius_edges(position, self.radius)
-            flat = (x.flatten(0, -2) for x in (z, carried, position))
-            return self._along_edges(*flat, edge_index).reshape(z.shape)
+            rows, states, places = (x.flatten(0, -2) for x in (z, carried, position))
+            return self._along_edges(rows, states, places, radius_edges(position, self.radius)).reshape(z.shape)
         messages, near = self._pairwise_messages(z, carried, position)
         near = near.unsqueeze(-1)
         if self.aggregation == "max":
