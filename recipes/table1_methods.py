@@ -1,0 +1,145 @@
+"""The methods of Table 1: how each is trained, and where its policy is."""
+
+from __future__ import annotations
+
+import json
+import shlex
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+from classic import METHODS as PLANNERS
+from tensordict.nn import TensorDictModuleBase
+from torchrl.envs import EnvBase
+
+from redig.files import replacing
+from redig.policy import load_policy, read_header
+
+RECIPES = Path(__file__).resolve().parent
+
+
+@dataclass(frozen=True)
+class Method:
+    """A row of the table."""
+
+    title: str
+    recipe: str | None = None
+    """The recipe that trains it; none for a method that plans, or that another one leaves behind."""
+    options: tuple[str, ...] = ()
+    of: str | None = None
+    """The method whose runs leave its policy behind."""
+    file: str = "policy.safetensors"
+
+
+METHODS: dict[str, Method] = {
+    "redig": Method("ReDiG", "redig_wedge.py"),
+    "leader_follower": Method("L&F"),
+    "dgnn": Method("DGNN (PPO)", "ppo_gnn.py", ("--method", "dgnn")),
+    "afor": Method("AFOR (PPO, spring-damper)", "ppo_gnn.py", ("--method", "afor")),
+    "afor_redig_reward": Method("AFOR with ReDiG's reward", "ppo_gnn.py", ("--method", "afor_redig_reward")),
+    "gaussian": Method("Gaussian actor, trained as ReDiG", "redig_wedge.py", ("--actor", "gaussian")),
+    "deterministic": Method("deterministic actor, trained as ReDiG", "redig_wedge.py", ("--actor", "deterministic")),
+    "cloned": Method("ReDiG before online training", of="redig", file="cloned.safetensors"),
+    "uncoordinated": Method("planners without coordination"),
+    "virtual_structure": Method("virtual structure (centralised)"),
+}
+
+
+@dataclass(frozen=True)
+class Job:
+    """One method on one formation with one seed."""
+
+    method: str
+    formation: str
+    seed: int | None
+    folder: Path
+
+    @property
+    def name(self) -> str:
+        """METHOD:FORMATION, and :SEED where it is trained."""
+        return f"{self.method}:{self.formation}" + (f":{self.seed}" if self.seed is not None else "")
+
+    @property
+    def command(self) -> tuple[str, ...]:
+        """The recipe and its options; empty for what is not trained."""
+        method = METHODS[self.method]
+        if method.recipe is None:
+            return ()
+        return (
+            method.recipe,
+            "--formation",
+            self.formation,
+            "--seed",
+            str(self.seed),
+            "--threads",
+            "1",
+            *method.options,
+        )
+
+    @property
+    def policy(self) -> Path | None:
+        """The policy file; none for a method that plans."""
+        return None if self.method in PLANNERS else self.folder / METHODS[self.method].file
+
+    @property
+    def starts_file(self) -> str:
+        """Name of the CSV file with the metrics of each start."""
+        return f"starts-{Path(METHODS[self.method].file).stem}.csv"
+
+    def matches(self, only: Sequence[str]) -> bool:
+        """Whether one of METHOD, METHOD:FORMATION, METHOD:FORMATION:SEED names it, or nothing is asked for."""
+        parts = self.name.split(":")
+        return not only or any(parts[: len(wanted.split(":"))] == wanted.split(":") for wanted in only)
+
+    def finished(self) -> bool:
+        """Whether its training has ended."""
+        return (self.folder / "metrics.json").exists()
+
+    def ready(self) -> bool:
+        """Whether it can be evaluated."""
+        return self.policy is None or (self.finished() and self.policy.exists())
+
+    def arguments(self, options: str) -> list[str]:
+        """The command line that trains it, from the start or from its checkpoint."""
+        recipe, *given = self.command
+        if (self.folder / "config.json").exists():
+            return [str(RECIPES / recipe), "--resume", str(self.folder)]
+        return [str(RECIPES / recipe), *given, "--out", str(self.folder), *shlex.split(options)]
+
+    def add_seconds(self, seconds: float) -> None:
+        """Add to the wall clock of its training, over all interruptions."""
+        with replacing(self.folder / "seconds.json") as file:
+            file.write_text(json.dumps(self.seconds() + seconds))
+
+    def seconds(self) -> float:
+        """Wall clock of its training (s)."""
+        path = self.folder / "seconds.json"
+        return json.loads(path.read_text()) if path.exists() else 0.0
+
+    def frames(self) -> int:
+        """Steps of single teams that its training collected, without demonstrations."""
+        path = self.folder / "config.json"
+        if not path.exists() or METHODS[self.method].recipe is None:
+            return 0
+        config = json.loads(path.read_text())
+        return config.get("frames") or config["num_envs"] * (config["warmup_steps"] + config["env_steps"])
+
+    def scenario(self) -> dict:
+        """Arguments of the scenario that it is evaluated in."""
+        return {"formation": self.formation} if self.policy is None else read_header(self.policy)[1]
+
+
+def jobs(formations: Sequence[str], seeds: Sequence[int], runs: Path) -> list[Job]:
+    """All of the table, those first that others need."""
+    found = []
+    for formation in formations:
+        for method, what in METHODS.items():
+            for seed in [None] if method in PLANNERS else seeds:
+                suffix = "" if seed is None else f"-seed{seed}"
+                found.append(Job(method, formation, seed, runs / f"{what.of or method}-{formation}{suffix}"))
+    return found
+
+
+def load(job: Job, env: EnvBase) -> TensorDictModuleBase:
+    """The policy of a job, for an environment."""
+    return PLANNERS[job.method](env.scenario) if job.policy is None else load_policy(job.policy)
