@@ -34,6 +34,8 @@ class PolicyConfig:
         hidden, step_dim, activation: see :class:`~redig.modules.DenoisingMLP`.
         diffusion_steps, schedule: see :class:`~redig.modules.NoiseSchedule`.
         sampling_steps, noise_ratio, early_stop, sampler, eta: see :func:`build_sampler`.
+        kind: ``"diffusion"``, or ``"gaussian"`` for the policy of the PPO baselines, see
+            :func:`~redig.baselines.ppo_gnn.gaussian_policy`, which has no denoiser and no sampler.
 
     Examples:
         >>> config = PolicyConfig(observation_dim=9, sampling_steps=5)
@@ -61,6 +63,7 @@ class PolicyConfig:
     early_stop: int | None = None
     sampler: str = "ddpm"
     eta: float = 0.0
+    kind: str = "diffusion"
 
 
 def build_sampler(
@@ -118,13 +121,16 @@ def build_encoder(config: PolicyConfig) -> TensorDictModule:
 def build_policy(
     config: PolicyConfig, *, fixed_latent: bool = False, warm_start: int | None = None
 ) -> TensorDictSequential:
-    """A new policy with random weights: graph encoder, then diffusion actor.
+    """A new policy with random weights: graph encoder, then diffusion actor, or Gaussian where ``kind`` says so.
 
     Args:
         config: the architecture.
         fixed_latent: read each robot's latent from ``("agents", "latent")`` instead of drawing one at each step.
         warm_start: step at which the chain begins with the action before, see :class:`~redig.modules.DiffusionActor`.
             For either, append the actor's ``make_tensordict_primer()`` to the environment.
+
+    Raises:
+        ValueError: for an unknown kind, or an option of the diffusion chain given to a Gaussian policy.
 
     Examples:
         >>> import torch
@@ -135,6 +141,16 @@ def build_policy(
         torch.Size([1, 5, 2])
     """
     low, high = torch.tensor(config.action_low), torch.tensor(config.action_high)
+    if config.kind == "gaussian":
+        from redig.baselines.ppo_gnn import (
+            gaussian_policy,
+        )  # a robot with a diffusion policy needs no baseline
+
+        if fixed_latent or warm_start is not None:
+            raise ValueError("fixed_latent, warm_start: a Gaussian policy has no chain; leave them out")
+        return gaussian_policy(build_encoder(config), config.embedding_dim, low, high, config.hidden, config.activation)
+    if config.kind != "diffusion":
+        raise ValueError(f"kind: got {config.kind!r}, allowed are diffusion, gaussian")
     actor = DiffusionActor(
         DenoisingMLP(len(low), config.embedding_dim, config.hidden, config.step_dim, config.activation),
         Bounded(low, high, low.shape),
@@ -248,6 +264,8 @@ def load_policy(
         )
     policy = build_policy(config, fixed_latent=fixed_latent, warm_start=warm_start)
     if sampler is not None:
+        if config.kind != "diffusion":
+            raise ValueError(f"sampler: {path} holds a {config.kind} policy, which has none; leave it out")
         policy = TensorDictSequential(policy[0], policy[1].with_sampler(sampler))
     try:
         policy.load_state_dict(load_file(path))
