@@ -49,7 +49,7 @@ class PPOConfig(Task):
     """Teams simulated in parallel."""
     horizon: int = 50
     """Steps of all teams in a round of collection."""
-    epochs: int = 4
+    epochs: int = 5
     """Passes over the data of a round."""
     batch_size: int = 400
     """Teams in a minibatch."""
@@ -61,6 +61,9 @@ class PPOConfig(Task):
     """Discount factor."""
     gae_lambda: float = 0.95
     """Lambda of the generalised advantage estimate."""
+    team_share: float = 0.0
+    """Share of the team's mean in a robot's reward, from 0 to 1. With their own rewards alone, robots that stand in
+    formation stay there: leaving alone costs each one what leaving together would not."""
     clip: float = 0.2
     """Range of the clipped probability ratio."""
     entropy: float = 0.0
@@ -77,11 +80,13 @@ class PPOConfig(Task):
     # networks
     encoder: str = "edgeconv"
     """edgeconv, or linear as printed in the paper."""
+    edge_features: str = "state"
+    """What a message says of the difference between two robots: all of their state, or position only."""
     radius: float = 2.0
     """Communication range (m)."""
-    message_width: int = 64
-    """Width of the messages between robots (default recipe: 128)."""
-    hidden: int = 64
+    message_width: int = 128
+    """Width of the messages between robots."""
+    hidden: int = 128
     """Width of the two hidden layers of policy and value."""
     activation: str = "tanh"
     """Nonlinearity of policy and value: tanh, relu, mish or silu."""
@@ -103,6 +108,8 @@ class PPOConfig(Task):
             "num_envs", "horizon", "epochs", "batch_size", "hidden", "num_trajectories", "clone_batch",
             "evaluation_interval", "evaluation_starts", "num_starts",
         )  # fmt: skip
+        if not 0 <= config.team_share <= 1:
+            raise ValueError(f"team_share: got {config.team_share}, must be in [0, 1]")
         if config.frames < config.num_envs * config.horizon:
             raise ValueError(
                 f"frames: got {config.frames}, must be at least one round, num_envs * horizon = "

@@ -58,7 +58,7 @@ def train(config: PPOConfig) -> dict[str, float]:
         policy,
         frames_per_batch=config.num_envs * config.horizon,
         total_frames=-1,
-        postproc=robot_by_robot,
+        postproc=partial(robot_by_robot, team_share=config.team_share),
         exploration_type=ExplorationType.RANDOM,
         auto_register_policy_transforms=False,
     )
@@ -110,8 +110,10 @@ def train(config: PPOConfig) -> dict[str, float]:
     return finish(run, config)
 
 
-def robot_by_robot(data: TensorDictBase) -> TensorDictBase:
+def robot_by_robot(data: TensorDictBase, team_share: float = 0.0) -> TensorDictBase:
     """What PPO needs of trajectories ``[E, T]``, with the ends of each robot's return beside its reward.
+
+    ``team_share`` of a robot's reward is the mean of its team's.
 
     A robot's return ends at a collision (where that terminates) without a bootstrap, and at the end of the team's
     episode with one. A robot that has arrived is steered by the environment, so its actions are not the actor's to
@@ -127,6 +129,8 @@ def robot_by_robot(data: TensorDictBase) -> TensorDictBase:
         ("next", *OBSERVATION),
         ("next", "agents", "reward"),
     )
+    reward = data["next", "agents", "reward"]
+    data["next", "agents", "reward"] = torch.lerp(reward, reward.mean(-2, keepdim=True), team_share)
     data["next", "agents", "terminated"] = terminated
     data["next", "agents", "done"] = terminated | ended
     data[ACTIVE] = active
@@ -187,6 +191,7 @@ def policy_architecture(config: PPOConfig, observation_dim: int) -> PolicyConfig
         radius=config.radius,
         encoder=config.encoder,
         encoder_activation="relu" if config.encoder == "edgeconv" else None,
+        edge_features=config.edge_features,
         hidden=(config.hidden,) * 2,
         activation=config.activation,
         kind="gaussian",

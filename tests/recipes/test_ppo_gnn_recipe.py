@@ -86,7 +86,8 @@ def test_an_interrupted_run_resumes_to_the_same_result(smoke_ppo, tmp_path, monk
     assert_same_run(smoke_ppo[0], tmp_path / "run")
 
 
-def test_without_a_warm_start_nothing_is_cloned(tmp_path):
+def test_without_a_warm_start_nothing_is_cloned(tmp_path, monkeypatch):
+    monkeypatch.setattr("finish.draw_crossing", lambda *arguments: None)
     options = {**SMOKE, "clone_updates": 0, "frames": 320}
     metrics = ppo_gnn.train(PPOConfig(method="dgnn", out=tmp_path / "run", threads=1, **options))
     assert "success_rate" in metrics and not (tmp_path / "run" / "cloned.safetensors").exists()
@@ -114,6 +115,7 @@ def test_frames_are_those_of_the_default_recipe():
     [
         ({"method": "dqn"}, r"method: got 'dqn', allowed are dgnn, afor, afor_redig_reward"),
         ({"frames": 10}, r"frames: got 10, must be at least one round"),
+        ({"team_share": 1.5}, r"team_share: got 1.5"),
         ({"epochs": 0}, r"epochs: got 0"),
         ({"formation": "star"}, r"formation: got 'star'"),
     ],
@@ -167,6 +169,16 @@ def test_advantages_against_a_double_loop():
     torch.testing.assert_close(found["agents", "advantage"].view_as(value), standardised, rtol=1e-3, atol=1e-4)
 
 
+def test_a_share_of_the_reward_is_the_team_mean():
+    config, policy, _ = parts()
+    data = make_env(2, **config.scenario()).rollout(3, policy)
+    own = data["next", "agents", "reward"].clone()
+    for share in (0.0, 0.25, 1.0):
+        found = ppo_gnn.robot_by_robot(data.clone(), share)["next", "agents", "reward"]
+        torch.testing.assert_close(found, (1 - share) * own + share * own.sum(-2, keepdim=True) / 5)
+    assert own.std(-2).max() > 0
+
+
 def test_robots_that_have_arrived_teach_the_actor_nothing():
     torch.manual_seed(0)
     config, policy, loss = parts()
@@ -191,7 +203,7 @@ def test_ppo_finds_a_known_answer():
     """One step to live, and a reward for moving to half the offset of the only teammate: the action is known."""
     torch.manual_seed(0)
     config, policy, loss = parts(epochs=4, batch_size=64, initial_std=0.3)
-    optimizer = torch.optim.Adam(loss.parameters(), 3e-3)
+    optimizer = torch.optim.Adam(loss.parameters(), 2e-3)
 
     def world(teams):
         observation = torch.zeros(teams, 1, 2, 9)
@@ -205,7 +217,7 @@ def test_ppo_finds_a_known_answer():
             return (policy(data)[ACTION] - answer).square().mean().sqrt().item()
 
     untrained = error()
-    for _ in range(60):
+    for _ in range(40):
         data, answer = world(256)
         with torch.no_grad():
             policy(data)

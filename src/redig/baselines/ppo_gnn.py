@@ -13,6 +13,7 @@ from collections.abc import Sequence
 import torch
 from tensordict.nn import (
     AddStateIndependentNormalScale,
+    InteractionType,
     ProbabilisticTensorDictModule,
     ProbabilisticTensorDictSequential,
     TensorDictModule,
@@ -38,7 +39,7 @@ def gaussian_policy(
     """A decentralised policy: encoder, perceptron, Gaussian squashed to the bounds of the action.
 
     The standard deviation before squashing is a parameter, one for each number of the action, as usual with PPO.
-    With ``ExplorationType.DETERMINISTIC`` the action is the squashed mean.
+    With ``ExplorationType.RANDOM`` (or none set) actions are sampled, otherwise the action is the squashed mean.
 
     Args:
         encoder: from the observation to one key, the embedding ``[*B, n, H]``.
@@ -80,6 +81,7 @@ def gaussian_policy(
             out_keys=[action_key],
             distribution_class=TanhNormal,
             distribution_kwargs={"low": low, "high": high},
+            default_interaction_type=InteractionType.RANDOM,
             return_log_prob=True,
             log_prob_key=log_prob,
         ),
