@@ -6,7 +6,7 @@ import dataclasses
 import json
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, Self
 
 # What suits each formation: too much weight, and a team keeps its shape rather than arrive; the bonus hurries it on.
 REWARD: dict[str, dict[str, Any]] = {
@@ -21,10 +21,8 @@ SMOKE: dict[str, Any] = {  # the whole program in under a minute; it learns noth
 
 
 @dataclass
-class Config:
-    """Train ReDiG on a team that crosses a narrow corridor in formation. Defaults differ from the paper's Table 3 where
-    its plain recipe does not survive online training; docs/paper.md says what and why.
-    """
+class Task:
+    """What every recipe that trains a team has: its run, the task, the reward and the evaluation."""
 
     out: Path | None = None
     """Folder of the run; default runs/FORMATION-seedSEED."""
@@ -78,6 +76,53 @@ class Config:
     """An arrival ends the robot's return; otherwise it holds and goes on earning the formation reward."""
     reward_scale: float = 0.1
     """Scale of the reward (paper: 0.01)."""
+
+    # evaluation
+    evaluation_interval: int = 200
+    """Steps of all teams between evaluations and checkpoints."""
+    evaluation_starts: int = 128
+    """Starts of an evaluation during training; the best policy is chosen on these."""
+    num_starts: int = 256
+    """Starts of the final evaluation, never trained on and never used for a choice."""
+
+    def scenario(self) -> dict[str, Any]:
+        """Arguments of :class:`redig.envs.FormationNavigation`."""
+        names = (
+            "formation", "n_robots", "formation_width", "corridor_width", "corridor_length", "max_speed",
+            "max_acceleration", "observe_direction", "formation_reward", "formation_weight", "omega",
+            "navigation_reward", "arrival_bonus", "collision_penalty", "proximity_penalty", "collision_terminates",
+            "arrival_terminates",
+        )  # fmt: skip
+        return {name: getattr(self, name) for name in names}
+
+    def saved(self) -> Self:
+        """The configuration of the run in the folder to resume.
+
+        Raises:
+            FileNotFoundError: if the folder holds no run.
+        """
+        path = self.resume / "config.json" if self.resume else None
+        if path is None or not path.is_file():
+            raise FileNotFoundError(f"resume: {self.resume} holds no run (no config.json)")
+        return dataclasses.replace(self, **{**json.loads(path.read_text()), "resume": self.resume, "out": None})
+
+    def filled(self, defaults: dict[str, Any]) -> Self:
+        """This configuration with ``defaults`` in place of what is None."""
+        missing = {name: value for name, value in defaults.items() if getattr(self, name) is None}
+        return dataclasses.replace(self, **missing)
+
+    def check_positive(self, *names: str) -> None:
+        """Raise a ValueError that names the first of these options that is less than 1."""
+        for name in names:
+            if getattr(self, name) < 1:
+                raise ValueError(f"{name}: got {getattr(self, name)}, must be at least 1")
+
+
+@dataclass
+class Config(Task):
+    """Train ReDiG on a team that crosses a narrow corridor in formation. Defaults differ from the paper's Table 3 where
+    its plain recipe does not survive online training; docs/paper.md says what and why.
+    """
 
     # demonstrations and cloning
     num_trajectories: int = 5000
@@ -184,24 +229,6 @@ class Config:
     best_of_n: int = 1
     """Collect with the best of N sampled actions by min Q; 1: off. Evaluations are of the policy itself."""
 
-    # evaluation
-    evaluation_interval: int = 200
-    """Steps of all teams between evaluations and checkpoints."""
-    evaluation_starts: int = 128
-    """Starts of an evaluation during training; the best policy is chosen on these."""
-    num_starts: int = 256
-    """Starts of the final evaluation, never trained on and never used for a choice."""
-
-    def scenario(self) -> dict[str, Any]:
-        """Arguments of :class:`redig.envs.FormationNavigation`."""
-        names = (
-            "formation", "n_robots", "formation_width", "corridor_width", "corridor_length", "max_speed",
-            "max_acceleration", "observe_direction", "formation_reward", "formation_weight", "omega",
-            "navigation_reward", "arrival_bonus", "collision_penalty", "proximity_penalty", "collision_terminates",
-            "arrival_terminates",
-        )  # fmt: skip
-        return {name: getattr(self, name) for name in names}
-
     def resolve(self) -> Config:
         """The configuration to run: that of a run to resume, or this one at toy size, checked.
 
@@ -210,22 +237,14 @@ class Config:
             ValueError: for an option out of its range.
         """
         if self.resume is not None:
-            path = self.resume / "config.json"
-            if not path.is_file():
-                raise FileNotFoundError(f"resume: {self.resume} holds no run (no config.json)")
-            saved = json.loads(path.read_text())
-            return dataclasses.replace(Config(**saved), resume=self.resume, out=None)
+            return self.saved()
         config = dataclasses.replace(self, **SMOKE) if self.smoke else self
-        for name, value in REWARD.get(config.formation, REWARD["wedge"]).items():
-            if getattr(config, name) is None:
-                config = dataclasses.replace(config, **{name: value})
-        for name in (
+        config = config.filled(REWARD.get(config.formation, REWARD["wedge"]))
+        config.check_positive(
             "num_trajectories", "clone_updates", "clone_batch", "num_envs", "collect_steps", "updates_per_step",
             "batch_size", "buffer_size", "evaluation_interval", "evaluation_starts", "num_starts", "hidden",
             "best_of_n",
-        ):  # fmt: skip
-            if getattr(config, name) < 1:
-                raise ValueError(f"{name}: got {getattr(config, name)}, must be at least 1")
+        )  # fmt: skip
         round_updates = config.collect_steps * config.updates_per_step
         if config.block < 1 or round_updates % config.block:
             raise ValueError(

@@ -17,7 +17,7 @@ from torchrl.envs.utils import ExplorationType
 from redig.checkpoint import load_checkpoint
 from redig.envs.factory import make_env
 from redig.evaluation import evaluate, format_table, rollout_trajectories, write_metrics
-from redig.modules import BestOfN
+from redig.modules import BestOfN, DiffusionActor
 from redig.policy import build_policy, build_sampler, load_policy, read_header
 from redig.viz import animate, plot_trajectories
 
@@ -94,7 +94,12 @@ def load(arguments: Arguments, observation_dim: int) -> TensorDictSequential:
     """The policy with the sampler and the options that the command line asks for."""
     config, _ = read_header(arguments.policy)
     given = {name: getattr(arguments, name) for name in ("sampler", "sampling_steps", "eta", "noise_ratio")}
-    config = replace(config, **{name: value for name, value in given.items() if value is not None})
+    given = {name: value for name, value in given.items() if value is not None}
+    if config.kind != "diffusion":
+        if given:
+            raise ValueError(f"{', '.join(given)}: {arguments.policy} holds a {config.kind} policy, which has no chain")
+        return load_policy(arguments.policy, observation_dim)
+    config = replace(config, **given)
     sampler = build_sampler(config.sampler, config.sampling_steps, config.noise_ratio, config.early_stop, config.eta)
     return load_policy(
         arguments.policy,
@@ -107,6 +112,8 @@ def load(arguments: Arguments, observation_dim: int) -> TensorDictSequential:
 
 def with_memory(env: TransformedEnv, policy: TensorDictSequential) -> TransformedEnv:
     """The environment, with what a policy with a fixed latent or a warm start keeps from step to step."""
+    if not isinstance(policy[-1], DiffusionActor):
+        return env
     shape = env.full_action_spec_unbatched["agents", "action"].shape
     return env.append_transform(policy[-1].make_tensordict_primer(shape))
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import platform
 
 import torch
-from config import Config
+from config import Task
 from evaluate import draw_crossing
 from run import Run
 
@@ -24,16 +24,18 @@ def score(metrics: dict[str, float]) -> float:
     return 4 * metrics["team_success_rate"] + metrics["cfi_0.5"] - 0.1 * time - 0.1 * excess_jerk
 
 
-def finish(run: Run, config: Config) -> dict[str, float]:
+def finish(run: Run, config: Task) -> dict[str, float]:
     """Evaluate the cloned, the last and the best policy of a run, and leave its metrics and pictures."""
     env = make_env(config.num_starts, **config.scenario())
     results = {}
     for name in ("cloned", "last", "policy"):
+        if name == "cloned" and not (run.folder / "cloned.safetensors").exists():
+            continue  # a baseline that starts from nothing
         results[name] = evaluate(load_policy(run.folder / f"{name}.safetensors"), env, seed=TEST_SEED)
         title = {"cloned": "cloned (before online training)", "policy": "best by validation"}.get(name, name)
         print(f"\n{title}, {config.num_starts} starts never trained on\n{format_table(results[name])}")
     metrics = results["policy"]
-    others = {f"{name}_{key}": value for name in ("cloned", "last") for key, value in results[name].items()}
+    others = {f"{name}_{key}": value for name in results if name != "policy" for key, value in results[name].items()}
     write_metrics(run.folder / "metrics.json", {**metrics, **others})
     plot_learning_curves(run.folder / "learning_curve.png", run.evaluations)
     draw_crossing(

@@ -31,7 +31,7 @@ FORMAT = "redig-policy-1"
 OBSERVATION, EMBEDDING, ACTION = ("agents", "observation"), ("agents", "embedding"), ("agents", "action")
 LATENT = ("agents", "latent")
 SAMPLERS = ("ddpm", "ddim", "dpmsolver")
-KINDS = ("diffusion", "gaussian", "deterministic")
+KINDS = ("diffusion", "gaussian", "deterministic", "ppo")
 
 
 @dataclass(frozen=True)
@@ -47,7 +47,8 @@ class PolicyConfig:
         diffusion_steps, schedule: see :class:`~redig.modules.NoiseSchedule`.
         sampling_steps, noise_ratio, early_stop, sampler, eta: see :func:`build_sampler`.
         kind: ``"diffusion"``; ``"gaussian"`` or ``"deterministic"`` for a :class:`~redig.modules.GaussianActor` of the
-            same width, which needs none of what concerns steps, schedule and sampler.
+            same width; ``"ppo"`` for the policy of the PPO baselines, see :func:`~redig.baselines.gaussian_policy`. Only
+            the first needs what concerns steps, schedule and sampler.
 
     Examples:
         >>> config = PolicyConfig(observation_dim=9, sampling_steps=5)
@@ -155,13 +156,17 @@ def build_policy(
     if config.kind not in KINDS:
         raise ValueError(f"kind: got {config.kind!r}, allowed are {', '.join(KINDS)}")
     low, high = torch.tensor(config.action_low), torch.tensor(config.action_high)
-    spec = Bounded(low, high, low.shape)
+    if config.kind != "diffusion" and (fixed_latent or warm_start is not None):
+        raise ValueError(f"fixed_latent, warm_start: a {config.kind} policy has no chain; leave them out")
+    encoder, spec = build_encoder(config), Bounded(low, high, low.shape)
+    if config.kind == "ppo":
+        from redig.baselines import gaussian_policy  # here, as a robot with a diffusion policy needs no baseline
+
+        return gaussian_policy(encoder, config.embedding_dim, low, high, config.hidden, config.activation)
     if config.kind != "diffusion":
-        if fixed_latent or warm_start is not None:
-            raise ValueError(f"fixed_latent, warm_start: a {config.kind} policy has no chain; leave them out")
         stochastic = config.kind == "gaussian"
         net = mlp(config.embedding_dim, config.hidden, len(low) * (1 + stochastic), config.activation)
-        return TensorDictSequential(build_encoder(config), GaussianActor(net, spec, [EMBEDDING], [ACTION], stochastic))
+        return TensorDictSequential(encoder, GaussianActor(net, spec, [EMBEDDING], [ACTION], stochastic))
     actor = DiffusionActor(
         DenoisingMLP(len(low), config.embedding_dim, config.hidden, config.step_dim, config.activation),
         spec,
@@ -172,7 +177,7 @@ def build_policy(
         latent_key=LATENT if fixed_latent else None,
         warm_start=warm_start,
     )
-    return TensorDictSequential(build_encoder(config), actor)
+    return TensorDictSequential(encoder, actor)
 
 
 def save_policy(
@@ -275,6 +280,8 @@ def load_policy(
         )
     policy = build_policy(config, fixed_latent=fixed_latent, warm_start=warm_start)
     if sampler is not None:
+        if config.kind != "diffusion":
+            raise ValueError(f"sampler: {path} holds a {config.kind} policy, which has none; leave it out")
         policy = TensorDictSequential(policy[0], policy[1].with_sampler(sampler))
     try:
         policy.load_state_dict(load_file(path))

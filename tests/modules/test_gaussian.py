@@ -103,7 +103,7 @@ def test_policy_files(kind, tmp_path):
 
 
 def test_errors():
-    with pytest.raises(ValueError, match="kind: got 'flow', allowed are diffusion, gaussian, deterministic"):
+    with pytest.raises(ValueError, match="kind: got 'flow', allowed are diffusion, gaussian, deterministic, ppo"):
         build_policy(PolicyConfig(observation_dim=9, kind="flow"))
     with pytest.raises(ValueError, match="a gaussian policy has no chain"):
         build_policy(PolicyConfig(observation_dim=9, kind="gaussian"), warm_start=3)

@@ -58,7 +58,7 @@ def plot_learning_curves(path: str | os.PathLike, *runs: Sequence[Row]) -> None:
             axes.set_ylim(limits)
         if axes.get_subplotspec().is_last_row():
             axes.set_xlabel("updates", size=9)
-    cloned = Line2D([], [], color=INK, linestyle=DASHES, linewidth=0.9, label="cloned policy")
+    cloned = Line2D([], [], color=INK, linestyle=DASHES, linewidth=0.9, label="before online training")
     figure.legend(handles=[cloned], loc="outside upper right", fontsize=8, frameon=False)
     with replacing(path) as unfinished:
         figure.savefig(unfinished, dpi=200)
