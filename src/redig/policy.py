@@ -47,8 +47,8 @@ class PolicyConfig:
         diffusion_steps, schedule: see :class:`~redig.modules.NoiseSchedule`.
         sampling_steps, noise_ratio, early_stop, sampler, eta: see :func:`build_sampler`.
         kind: ``"diffusion"``; ``"gaussian"`` or ``"deterministic"`` for a :class:`~redig.modules.GaussianActor` of the
-            same width; ``"ppo"`` for the policy of the PPO baselines, see :func:`~redig.baselines.gaussian_policy`. Only
-            the first needs what concerns steps, schedule and sampler.
+            same width; ``"ppo"`` for the policy of the PPO baselines, see :func:`~redig.baselines.gaussian_policy`.
+            Only the first needs what concerns steps, schedule and sampler.
 
     Examples:
         >>> config = PolicyConfig(observation_dim=9, sampling_steps=5)

@@ -108,7 +108,7 @@ def test_bad_input_is_named():
         state_value(encoder(), 64, activation="step")
     with pytest.raises(ValueError, match="kind: got 'oracle', allowed are diffusion, gaussian"):
         build_policy(PolicyConfig(9, kind="oracle"))
-    with pytest.raises(ValueError, match="a Gaussian policy has no chain"):
+    with pytest.raises(ValueError, match="a ppo policy has no chain"):
         build_policy(PolicyConfig(9, kind="ppo"), fixed_latent=True)
 
 
@@ -126,5 +126,5 @@ def test_a_policy_file_gives_the_same_actions(tmp_path):
         one, two = (net(team(observation))[ACTION] for net in (module, load_policy(path, 9)))
     assert torch.equal(one, two)
     assert math.isfinite(one.sum().item()) and one.std() > 0.01
-    with pytest.raises(ValueError, match="holds a gaussian policy"):
+    with pytest.raises(ValueError, match="holds a ppo policy"):
         load_policy(path, sampler=DDPM(5))
