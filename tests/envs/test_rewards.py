@@ -7,7 +7,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from redig.envs import rewards
-from redig.envs.formations import FORMATIONS, formation_offsets, pairwise_distances
+from redig.envs.formations import FORMATIONS, formation_integrity, formation_offsets, pairwise_distances
 
 seeds = st.integers(0, 10_000)
 
@@ -116,6 +116,35 @@ def test_an_error_across_counts_against_the_squeezed_width():
     scale, residual = rewards.best_lateral_scale(position, offsets, torch.tensor([1.0, 0.0]))
     torch.testing.assert_close(scale, torch.tensor(0.5))
     torch.testing.assert_close(residual, torch.tensor([0.1, 0.2, 0.1]))
+
+
+@given(seeds, st.floats(-1.5, 1.5), st.floats(0.3, 1.1), st.floats(-math.pi, math.pi))
+@settings(max_examples=60, deadline=None)
+def test_a_leaning_line_pays_for_squeeze_and_slant_only(seed, slant, squeeze, angle):
+    offsets = formation_offsets("line", 5).double()
+    echelon = torch.stack([slant * offsets[:, 1], squeeze * offsets[:, 1]], -1)
+    turn = torch.tensor([[math.cos(angle), math.sin(angle)], [-math.sin(angle), math.cos(angle)]]).double()
+    ahead = torch.tensor([1.0, 0.0]).double() @ turn
+    found = rewards.slanted_formation_bonus(echelon @ turn + 3.0, offsets, ahead)
+    expected = 1 - 0.5 * max(1 - squeeze, 0) - 0.1 * abs(slant)
+    torch.testing.assert_close(found, torch.full((5,), expected).double(), atol=1e-6, rtol=0)
+    assert formation_integrity("line", echelon @ turn).item() == pytest.approx(1, abs=1e-6)
+
+
+@given(seeds, st.sampled_from(["line", "wedge", "circle"]))
+@settings(max_examples=40, deadline=None)
+def test_no_slant_of_a_grid_leaves_a_smaller_residual(seed, name):
+    offsets, ahead = formation_offsets(name, 5).double(), torch.tensor([1.0, 0.0]).double()
+    noise, _ = random_team(seed, 5, spread=0.05)
+    position = offsets + noise + torch.stack([0.4 * offsets[:, 1], torch.zeros(5).double()], -1)
+    relative = position - position.mean(0)
+    errors = [
+        (relative[:, 0] - offsets[:, 0] - k * offsets[:, 1]).square().sum() for k in torch.linspace(-1.5, 1.5, 3001)
+    ]
+    best = -1.5 + 0.001 * int(torch.stack(errors).argmin())
+    upright = position - torch.stack([best * offsets[:, 1], torch.zeros(5).double()], -1)
+    expected = rewards.scaled_formation_bonus(upright, offsets, ahead) - 0.1 * abs(best)
+    torch.testing.assert_close(rewards.slanted_formation_bonus(position, offsets, ahead), expected, atol=5e-3, rtol=0)
 
 
 @given(seeds, st.floats(0, 2), st.floats(-math.pi, math.pi), st.floats(0.1, 5))

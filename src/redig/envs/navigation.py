@@ -12,7 +12,7 @@ from redig.envs.dynamics import VelocityCommand, leave_walls, part_robots
 from redig.envs.formations import formation_offsets, pairwise_distances
 from redig.envs.maps import ObstacleMap, corridor
 
-FORMATION_REWARDS = ("spring_damper", "spring_damper_bonus", "scaled", "none")
+FORMATION_REWARDS = ("spring_damper", "spring_damper_bonus", "scaled", "slanted", "none")
 NAVIGATION_REWARDS = ("goal_speed", "progress")
 
 
@@ -33,9 +33,9 @@ class FormationNavigation(BaseScenario):
       ``corridor_angle``. ``position_jitter`` (m) and ``heading_jitter`` (rad): half ranges of what is added to each.
     * ``radius`` (m), ``max_speed`` (m/s), ``max_acceleration`` (m/s²), ``dt`` (s): the robots.
     * ``observe_direction``: add the unit vector to the nearest obstacle (9 numbers); ``False`` gives the paper's 7.
-    * ``formation_reward``: one of ``spring_damper`` (Eq. 29), ``spring_damper_bonus``, ``scaled``, ``none``;
-      ``formation_weight``; ``omega``. The frame of ``scaled`` is the goal formation's heading, so that the goal
-      itself is a perfect formation.
+    * ``formation_reward``: one of ``spring_damper`` (Eq. 29), ``spring_damper_bonus``, ``scaled``, ``slanted``,
+      ``none``; ``formation_weight``; ``omega``. The frame of ``scaled`` and ``slanted`` is the goal formation's heading, so that
+      the goal itself is a perfect formation.
     * ``navigation_reward``: ``goal_speed`` (Eq. 30) or ``progress``; ``arrival_bonus``, ``goal_radius`` (m);
       ``collision_penalty``; ``proximity_penalty`` and ``proximity_margin`` (m), a ramp before contact.
     * ``collision_terminates``, ``arrival_terminates``: what ends the task of one robot (``info["terminated"]``).
@@ -237,6 +237,8 @@ class FormationNavigation(BaseScenario):
     def _formation_reward(self, position: Tensor, velocity: Tensor) -> Tensor:
         if self.formation_reward == "scaled":
             bonus = rewards.scaled_formation_bonus(position, self.offsets, self.direction)
+        elif self.formation_reward == "slanted":
+            bonus = rewards.slanted_formation_bonus(position, self.offsets, self.direction)
         elif self.formation_reward == "spring_damper_bonus":
             bonus = rewards.spring_damper_bonus(position, velocity, self.desired, self.omega)
         elif self.formation_reward == "spring_damper":

@@ -142,6 +142,43 @@ def scaled_formation_bonus(
     return 1 - (residual / tolerance).clamp_max(1) - squeeze_cost * (1 - scale).clamp_min(0).unsqueeze(-1)
 
 
+def slanted_formation_bonus(
+    position: Tensor,
+    offsets: Tensor,
+    direction: Tensor,
+    slant_cost: float = 0.1,
+    steepest: float = 1.5,
+) -> Tensor:
+    """:func:`scaled_formation_bonus` for a shape that may also lean, such as a line, which stays a line.
+
+    The slant ``k = sum f_y q_x / sum f_y^2``, clamped, is by how much the team's left is ahead of its right (m a metre
+    of the full formation). It is taken out before the scale is fitted, at ``slant_cost * |k|``. Robots abreast that are
+    too broad for a gap side by side pass it in echelon, in proportion all the way; a wedge that leans is none.
+
+    Args:
+        position: ``[*B, n, 2]`` (m).
+        offsets: the formation ``[n, 2]`` (m).
+        direction: unit vector of travel ``[*B, 2]``.
+        slant_cost: price of a slant of one; it makes the team straighten up again.
+        steepest: largest slant, to either side.
+
+    Returns:
+        reward ``[*B, n]``, at most 1.
+
+    Examples:
+        >>> import torch
+        >>> from redig.envs.formations import formation_offsets
+        >>> line = formation_offsets("line", 5)
+        >>> echelon = torch.stack([0.5 * line[:, 1], line[:, 1]], -1)  # turned by 27 degrees
+        >>> slanted_formation_bonus(echelon, line, torch.tensor([1.0, 0.0])).round(decimals=4)
+        tensor([0.9500, 0.9500, 0.9500, 0.9500, 0.9500])
+    """
+    forward = (position * direction.unsqueeze(-2)).sum(-1)
+    slant = ((forward * offsets[:, 1]).sum(-1) / offsets[:, 1].square().sum()).clamp(-steepest, steepest).unsqueeze(-1)
+    upright = position - (slant * offsets[:, 1]).unsqueeze(-1) * direction.unsqueeze(-2)
+    return scaled_formation_bonus(upright, offsets, direction) - slant_cost * slant.abs()
+
+
 def goal_speed(position: Tensor, velocity: Tensor, goal: Tensor) -> Tensor:
     """The moving part of Eq. 30, ``q . r / |r| * |q|``: speed times its alignment with the goal. ``[*B, n]``.
 
