@@ -34,8 +34,8 @@ class FormationNavigation(BaseScenario):
     * ``radius`` (m), ``max_speed`` (m/s), ``max_acceleration`` (m/s²), ``dt`` (s): the robots.
     * ``observe_direction``: add the unit vector to the nearest obstacle (9 numbers); ``False`` gives the paper's 7.
     * ``formation_reward``: one of ``spring_damper`` (Eq. 29), ``spring_damper_bonus``, ``scaled``, ``slanted``,
-      ``none``; ``formation_weight``; ``omega``. The frame of ``scaled`` and ``slanted`` is the goal formation's heading, so that
-      the goal itself is a perfect formation.
+      ``none``; ``formation_weight``; ``omega``. The frame of ``scaled`` and ``slanted`` is the goal formation's
+      heading, so that the goal itself is a perfect formation.
     * ``navigation_reward``: ``goal_speed`` (Eq. 30) or ``progress``; ``arrival_bonus``, ``goal_radius`` (m);
       ``collision_penalty``; ``proximity_penalty`` and ``proximity_margin`` (m), a ramp before contact.
     * ``collision_terminates``, ``arrival_terminates``: what ends the task of one robot (``info["terminated"]``).
