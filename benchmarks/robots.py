@@ -12,7 +12,6 @@ import statistics
 import subprocess
 import sys
 import tempfile
-import time
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -34,12 +33,12 @@ class Arguments:
     """Steps of the chain (DDPM without noise)."""
     rates: tuple[float, ...] = (20.0, 100.0)
     """Wanted rates (Hz), one for each of the steps."""
+    kinds: tuple[str, ...] = ("onnx", "safetensors")
+    """Kinds of policy files."""
     robots: int = 5
     """Processes at a time."""
     seconds: float = 20.0
     """Length of each run."""
-    wait: float = 10.0
-    """Time for all processes to start (s)."""
     out: Path = Path("docs/results/robots")
     """Folder for the table."""
 
@@ -49,9 +48,10 @@ def main(arguments: Arguments) -> list[dict[str, Any]]:
     rows = []
     with tempfile.TemporaryDirectory() as folder:
         for steps, rate in zip(arguments.steps, arguments.rates, strict=True):
-            for kind, path in write_files(arguments.policy, steps, Path(folder)).items():
+            files = write_files(arguments.policy, steps, Path(folder))
+            for kind in arguments.kinds:
                 load = os.getloadavg()[0]
-                robots = run_team(arguments, path, rate)
+                robots = run_team(arguments, files[kind], rate)
                 rows.append({"file": kind, "steps": steps, "wanted (Hz)": rate, **worst(robots), "load before": load})
     notes = [
         f"{arguments.robots} processes at once, {arguments.seconds:g} s each, {arguments.policy}, DDPM without noise, "
@@ -77,18 +77,17 @@ def write_files(policy: Path, steps: int, folder: Path) -> dict[str, Path]:
 
 def run_team(arguments: Arguments, path: Path, rate: float) -> list[dict[str, float]]:
     """What each of the processes measured."""
-    begin = time.time() + arguments.wait
     command = [sys.executable, str(Path(__file__).with_name("robot_process.py")), str(path)]
-    command += [str(number) for number in (rate, arguments.seconds, begin)]
+    command += [str(number) for number in (rate, arguments.seconds)]
     environment = os.environ | {"OMP_NUM_THREADS": "1", "MKL_NUM_THREADS": "1"}
-    robots = [
-        subprocess.Popen(command, stdout=subprocess.PIPE, env=environment, text=True) for _ in range(arguments.robots)
-    ]
-    outputs = [robot.communicate()[0] for robot in robots]
+    pipes: Any = {"stdin": subprocess.PIPE, "stdout": subprocess.PIPE, "text": True}
+    robots = [subprocess.Popen(command, env=environment, **pipes) for _ in range(arguments.robots)]
+    if not all([robot.stdout.readline() for robot in robots]):
+        raise RuntimeError("robot_process.py: a process ended before it was ready; its error is above")
     for robot in robots:
-        if robot.returncode:
-            raise RuntimeError(f"robot_process.py: exit status {robot.returncode}")
-    return [json.loads(output) for output in outputs]
+        robot.stdin.write("go\n")
+        robot.stdin.flush()
+    return [json.loads(robot.communicate()[0]) for robot in robots]
 
 
 def worst(robots: list[dict[str, float]]) -> dict[str, float]:

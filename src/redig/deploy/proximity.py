@@ -20,7 +20,13 @@ from redig.deploy.messages import Vector
 
 
 class Proximity(NamedTuple):
-    """The nearest obstacle: distance (m), negative inside one, and the unit vector towards it, or zeros."""
+    """The nearest obstacle: distance (m), negative inside one, and the unit vector towards it, or zeros.
+
+    Examples:
+        >>> ahead = Proximity(0.5, (1.0, 0.0))
+        >>> ahead.distance
+        0.5
+    """
 
     distance: float
     direction: Vector
@@ -51,7 +57,7 @@ def to_robot(vector: Vector, heading: float) -> Vector:
 
 @dataclass(frozen=True, eq=False)
 class OccupancyGrid:
-    """Square cells of a map, occupied or not, as ROS's ``nav_msgs/OccupancyGrid`` has them; beyond them all is occupied.
+    """Square cells of a map, occupied or not, as in ROS's ``nav_msgs/OccupancyGrid``; beyond them all is occupied.
 
     Args:
         occupied: ``[H, W]``, bool; row 0 has the smallest y.

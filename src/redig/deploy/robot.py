@@ -14,8 +14,8 @@ from redig.deploy.messages import RobotState
 WIDTHS = (7, 9)  # of an observation: without and with the direction to the nearest obstacle
 
 
-class Network(Protocol):
-    """What a robot runs: an :class:`~redig.deploy.ExportedPolicy` or a :class:`~redig.deploy.ModulePolicy`."""
+class _Network(Protocol):
+    """What a robot runs: an exported policy or a module policy."""
 
     config: dict[str, Any] | None
     environment: dict[str, Any]
@@ -41,7 +41,8 @@ class RobotPolicy:
     Args:
         policy: a file, ``.onnx`` as written by ``export_policy(..., ego=True)``, which needs no torch, or
             ``.safetensors`` as written by :func:`~redig.policy.save_policy`, which does, and is run with its own
-            sampler and without noise; or a network that was loaded with other options.
+            sampler and without noise; or an :class:`~redig.deploy.ExportedPolicy` or
+            :class:`~redig.deploy.ModulePolicy` that was loaded with other options.
 
     Attributes:
         network: what it runs.
@@ -66,7 +67,7 @@ class RobotPolicy:
         ((2,), (2,))
     """
 
-    def __init__(self, policy: str | Path | Network) -> None:
+    def __init__(self, policy: str | Path | _Network) -> None:
         self.network = _load(policy) if isinstance(policy, str | Path) else policy
         self.config, self.environment = self.network.config, self.network.environment
         if not self.network.ego:
@@ -115,7 +116,7 @@ def _observation(state: RobotState) -> list[float]:
     return [x, y, *state.velocity, goal_x - x, goal_y - y, state.obstacle_distance, *state.obstacle_direction]
 
 
-def _load(path: str | Path) -> Network:
+def _load(path: str | Path) -> _Network:
     suffix = Path(path).suffix
     if suffix == ".onnx":
         from redig.deploy.runtime import load_policy

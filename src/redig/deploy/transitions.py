@@ -12,6 +12,11 @@ class Transition(NamedTuple):
     """Factors of one step: of the action and the predicted noise in the estimate of ``a^0``, then those of the sampler.
 
     At the last step, those of the sampler are 1 for the estimate and 0 for the rest.
+
+    Examples:
+        >>> last = Transition(step=19, of_action=1.1, of_predicted=-0.4)
+        >>> last.c0, last.sigma
+        (1.0, 0.0)
     """
 
     step: int
