@@ -44,15 +44,7 @@ class Arguments:
 
 
 def main(arguments: Arguments) -> list[dict[str, Any]]:
-    """Write both files for each number of steps, run the teams, report."""
-    rows = []
-    with tempfile.TemporaryDirectory() as folder:
-        for steps, rate in zip(arguments.steps, arguments.rates, strict=True):
-            files = write_files(arguments.policy, steps, Path(folder))
-            for kind in arguments.kinds:
-                load = os.getloadavg()[0]
-                robots = run_team(arguments, files[kind], rate)
-                rows.append({"file": kind, "steps": steps, "wanted (Hz)": rate, **worst(robots), "load before": load})
+    """Write both files for each number of steps, run the teams, report what there is after each."""
     notes = [
         f"{arguments.robots} processes at once, {arguments.seconds:g} s each, {arguments.policy}, DDPM without noise, "
         f"own state and four neighbours, on {len(os.sched_getaffinity(0))} cores. Of the robots the worst: the lowest "
@@ -61,7 +53,15 @@ def main(arguments: Arguments) -> list[dict[str, Any]]:
         "action, after the imports.",
         "Load before: processes that wanted a core in the minute before, of other work on the machine.",
     ]
-    report(arguments.out, "rates", rows, notes, threads=1)
+    rows: list[dict[str, Any]] = []
+    with tempfile.TemporaryDirectory() as folder:
+        for steps, rate in zip(arguments.steps, arguments.rates, strict=True):
+            files = write_files(arguments.policy, steps, Path(folder))
+            for kind in arguments.kinds:
+                load = os.getloadavg()[0]
+                robots = run_team(arguments, files[kind], rate)
+                rows.append({"file": kind, "steps": steps, "wanted (Hz)": rate, **worst(robots), "load before": load})
+                report(arguments.out, "rates", rows, notes, threads=1)
     return rows
 
 

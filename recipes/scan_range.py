@@ -31,9 +31,9 @@ class Arguments:
 
     policy: Path = Path("recipes/policies/wedge.safetensors")
     """The policy file."""
-    ranges: tuple[float, ...] = (4.0, 2.0, 1.0, 0.5)
+    ranges: tuple[float, ...] = (2.0, 1.0, 0.5)
     """Ranges of the sensor (m)."""
-    starts: int = 128
+    starts: int = 64
     """Starts of each drive."""
     seed: int = 1_000_000
     """Seed of the starts, of those that settings may be chosen by."""

@@ -77,6 +77,7 @@ def main(arguments: Arguments) -> list[dict[str, Any]]:
                             "rms (m)": round(float(np.sqrt((error**2).mean())), 4),
                             "max (m)": round(float(error.max()), 4),
                             "end (m)": round(float(error[:, -1].mean()), 4),
+                            "aside, max (m)": round(max(map(aside, followed, path)), 4),
                         }
                     )
                     print(*rows[-1].values(), sep="\t")
@@ -130,6 +131,14 @@ def follow(path: Array, base: Base, reverse: bool, feedback: float) -> Array:
             x, y, heading = advance(x, y, heading, linear, angular, dt)
         places.append((x, y))
     return np.array(places)
+
+
+def aside(followed: Array, path: Array) -> float:
+    """How far off the whole of the path ``[T + 1, 2]`` the places ``[T + 1, 2]`` are at most (m), whenever they are."""
+    start, way = path[:-1], np.diff(path, axis=0)
+    length = np.maximum((way**2).sum(-1), 1e-12)
+    part = np.clip(((followed[:, None] - start) * way).sum(-1) / length, 0, 1)  # [T + 1, T]
+    return float(np.linalg.norm(followed[:, None] - start - part[..., None] * way, axis=-1).min(-1).max())
 
 
 def advance(x: float, y: float, heading: float, linear: float, angular: float, dt: float) -> tuple[float, float, float]:

@@ -35,6 +35,12 @@ def test_what_a_base_loses_while_it_gains_speed():
     np.testing.assert_allclose(lost[5:], np.tile([expected, 0.0], (len(lost) - 5, 1)), atol=1e-9)
 
 
+def test_aside_does_not_count_what_is_late():
+    path = np.array([[0.0, 0.0], [1.0, 0.0], [2.0, 0.0], [2.0, 1.0]])
+    assert tracking.aside(np.array([[0.0, 0.0], [0.3, 0.1], [0.9, -0.2], [1.9, 0.5]]), path) == pytest.approx(0.2)
+    assert tracking.aside(path[[0, 0, 1, 1]], path) == 0
+
+
 def test_feedback_takes_it_back():
     path = tracking.curve(tracking.CURVES["to the side"])[0]
     ends = [np.linalg.norm(path[-1] - tracking.follow(path, LIMO, True, gain)[-1]) for gain in (0.0, 1.0)]
