@@ -8,9 +8,8 @@ minute for 100 of them, where this way it is a few seconds for any number. (The 
 from __future__ import annotations
 
 import copy
-import math
 from collections.abc import Sequence
-from typing import Any, NamedTuple, cast
+from typing import Any, cast
 
 import numpy as np
 import onnx_ir as ir
@@ -20,7 +19,7 @@ from onnxscript import opset20 as op
 from torch import Tensor, nn
 
 from redig.deploy.parts import Condition, denoiser_step
-from redig.modules import NoiseSchedule, Sampler
+from redig.deploy.transitions import Transition, chain_transitions
 from redig.modules.diffusion import DiffusionPolicy
 
 OPSET, DOMAIN = 20, "redig"
@@ -43,13 +42,13 @@ def unroll(
         ValueError: if the sampler has a loop of its own.
 
     Examples:
-        >>> from redig.modules import DDPM, DenoisingMLP
+        >>> from redig.modules import DDPM, DenoisingMLP, NoiseSchedule
         >>> policy = DiffusionPolicy(DenoisingMLP(2, 8), NoiseSchedule(10), DDPM(3), -torch.ones(2), torch.ones(2))
         >>> model = unroll(nn.Identity(), policy, "embedding", 8, stochastic=True)
         >>> [(value.name, str(value.shape)) for value in model.graph.inputs]
         [('embedding', '[teams,robots,8]'), ('latent', '[teams,robots,2]'), ('noise', '[2,teams,robots,2]')]
     """
-    transitions = _transitions(policy.sampler, policy.schedule, deterministic=not stochastic)
+    transitions = chain_transitions(policy.sampler, policy.schedule, deterministic=not stochastic)
     encoder, denoiser = (copy.deepcopy(module).cpu().float() for module in (encoder, policy.denoiser))
     low, high = policy.low.cpu().float(), policy.high.cpu().float()
     step, action_dim = denoiser_step(denoiser), len(low)
@@ -92,39 +91,9 @@ def unroll(
     return model
 
 
-class _Transition(NamedTuple):
-    """Factors of one step: of the action and the predicted noise in the estimate of ``a^0``, then those of the sampler.
-
-    At the last step, those of the sampler are 1 for the estimate and 0 for the rest.
-    """
-
-    step: int
-    of_action: float
-    of_predicted: float
-    c0: float = 1.0
-    ck: float = 0.0
-    c_older: float = 0.0
-    sigma: float = 0.0
-
-
-def _transitions(sampler: Sampler, schedule: NoiseSchedule, deterministic: bool) -> list[_Transition]:
-    if type(sampler).__call__ is not Sampler.__call__:
-        raise ValueError(f"sampler: {sampler} has a loop of its own; only its coefficients can be exported")
-    steps = sampler.timesteps(schedule)
-    transitions, older = [], None
-    for step, previous in zip(steps, [*steps[1:], None], strict=True):
-        signal = schedule.signal(step)
-        estimate = 1 / math.sqrt(signal), -math.sqrt(1 / signal - 1)
-        following = () if previous is None else sampler.coefficients(schedule, step, previous, older, deterministic)
-        transition = _Transition(step, *estimate, *following)
-        transitions.append(transition._replace(sigma=0.0) if deterministic else transition)
-        older = step
-    return transitions
-
-
 def _chain(
     writer: _Writer,
-    transitions: Sequence[_Transition],
+    transitions: Sequence[Transition],
     times: Tensor,
     action: ir.Value,
     condition: ir.Value,

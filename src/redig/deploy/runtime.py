@@ -31,6 +31,7 @@ class ExportedPolicy:
         sampler: name and options of the sampler.
         stochastic: whether it takes a latent and noise.
         ego: whether it gives the action of the first robot only.
+        width: of an observation, or embedding.
 
     Examples:
         >>> import tempfile
@@ -51,7 +52,7 @@ class ExportedPolicy:
         self.config, self.environment, self.sampler = header["policy"], header["environment"], header["sampler"]
         self._session, self._generator = session, np.random.default_rng(seed)
         first, *random = session.get_inputs()
-        self._input, self._width = first.name, first.shape[-1]
+        self._input, self.width = first.name, first.shape[-1]
         shape = session.get_outputs()[0].shape
         self._action_dim, self.ego = shape[-1], len(shape) == 2
         self.stochastic = bool(random)
@@ -75,8 +76,8 @@ class ExportedPolicy:
             ValueError: if a shape does not fit the policy, or the observation is not finite.
         """
         observation = np.asarray(observation, np.float32)
-        if observation.ndim < 2 or observation.shape[-1] != self._width or observation.shape[-2] < 1:
-            expected = f"[*B, n, {self._width}] with n of at least 1"
+        if observation.ndim < 2 or observation.shape[-1] != self.width or observation.shape[-2] < 1:
+            expected = f"[*B, n, {self.width}] with n of at least 1"
             raise ValueError(f"{self._input}: got shape {list(observation.shape)}, expected {expected}")
         if not np.isfinite(observation).all():
             raise ValueError(f"{self._input}: got values that are not finite")
