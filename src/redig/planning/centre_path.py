@@ -33,9 +33,7 @@ def team_grid(obstacle_map: ObstacleMap, radius: float, reach: float) -> Occupan
     """
     room = obstacle_map.gap / 2 - radius
     if not room > 0:
-        raise ValueError(
-            f"obstacle_map: its gap of {obstacle_map.gap} m is too narrow for a robot of {radius} m radius"
-        )
+        raise ValueError(f"obstacle_map: a gap of {obstacle_map.gap} m is too narrow for a robot of {radius} m radius")
     resolution = min(0.1, room / 2)
     return occupancy_grid(obstacle_map, resolution, inflation=min(obstacle_map.gap / 2 - resolution, reach))
 

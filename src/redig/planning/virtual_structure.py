@@ -67,7 +67,7 @@ class StructurePlanner:
     radius: float
     clearance: float = 0.025
     delay_cost: float = 0.2
-    approach: float = 3.0
+    approach: float = 2.0
     corner: float = 0.6
     effort: float = 0.8
 
