@@ -18,9 +18,7 @@ from redig.planning.timing import time_scaling
 
 SPACING = 0.02  # m, between samples of a way
 LEVELS = 41  # of the squeeze, from none to full
-EARLY = (
-    0.6  # share of the smoothing window by which the squeeze comes early; smoothing then costs a few mm of clearance
-)
+EARLY = 0.6  # share of the smoothing window by which a squeeze comes early, so that smoothing costs few millimetres
 
 
 @dataclass(frozen=True, eq=False)
