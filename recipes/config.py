@@ -126,9 +126,9 @@ class Config(Task):
 
     # demonstrations and cloning
     num_trajectories: int = 5000
-    """Trajectories of single robots, planned without coordination."""
+    """Trajectories of single robots, planned without coordination unless planner says otherwise."""
     planner: str = "astar"
-    """astar or rrt."""
+    """astar, rrt, or virtual_structure: teams that are coordinated by one plan."""
     clone_updates: int = 3000
     """Updates of the diffusion loss on demonstrations before online training."""
     clone_batch: int = 128

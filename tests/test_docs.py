@@ -20,7 +20,10 @@ PAGES = [page for page in sorted((ROOT / "docs").rglob("*.md")) if "```python" i
 MODULES = ["redig", *sorted(module.name for module in pkgutil.walk_packages(redig.__path__, "redig."))]
 PUBLIC = [
     "redig",
-    *(f"redig.{name}" for name in ("modules", "objectives", "envs", "planning", "evaluation", "viz", "deploy")),
+    *(
+        f"redig.{name}"
+        for name in ("modules", "objectives", "envs", "planning", "baselines", "evaluation", "viz", "deploy")
+    ),
 ]
 
 

@@ -1,4 +1,4 @@
-"""Demonstrations: every robot follows its own plan at its own speed, in the real environment, uncoordinated."""
+"""Demonstrations in the real environment: uncoordinated, each robot by its own plan, or all by one for the team."""
 
 from __future__ import annotations
 
@@ -6,6 +6,8 @@ import hashlib
 import math
 import os
 import warnings
+from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -15,15 +17,11 @@ from torch import Tensor
 from torchrl.envs import EnvBase, TransformedEnv
 from tqdm import tqdm
 
-from redig.envs.maps import ObstacleMap
 from redig.envs.seeding import preserve_rng_state
 from redig.files import replacing
-from redig.planning.astar import astar
-from redig.planning.grid import OccupancyGrid, occupancy_grid
-from redig.planning.rrt import rrt
-from redig.planning.tracking import PathTracker, pad_paths
+from redig.planning.plans import plan_alone, plan_together
 
-PLANNERS = ("astar", "rrt")
+PLANNERS = ("astar", "rrt", "virtual_structure")
 VERSION = 3  # part of the cache's hash: raise it whenever this package would make different demonstrations
 KEYS = (
     ("agents", "observation"),
@@ -52,6 +50,9 @@ def demonstrations(
 ) -> TensorDict:
     """Trajectories of robots that each track their own plan, as transitions of ``env``.
 
+    With ``planner="virtual_structure"`` the team's plan is one, see
+    :class:`~redig.planning.virtual_structure.StructurePlanner`, and ``speed`` is that of its fastest robot.
+
     A trajectory is one robot's, so ``ceil(num_trajectories / n_robots)`` team episodes are run, ``env.batch_size[0]``
     at a time. The same arguments give the same demonstrations; the random states of the caller are left untouched, and
     the environment must be reset before it is used again.
@@ -59,8 +60,8 @@ def demonstrations(
     Args:
         env: ``VmasEnv(FormationNavigation(), ...)``, with or without transforms that leave the observation as it is.
         num_trajectories: number of trajectories of single robots.
-        planner: ``"astar"`` or ``"rrt"``.
-        speed: lowest and highest speed of a robot (m/s); each robot draws its own for an episode.
+        planner: ``"astar"`` or ``"rrt"``, or ``"virtual_structure"`` for teams that are coordinated.
+        speed: lowest and highest speed of a robot (m/s); each robot (or coordinated team) draws its own for an episode.
         noise: standard deviation of the Gaussian noise added to the commands (m/s).
         max_steps: limit on the steps of an episode.
         seed: of starts, goals, speeds, noise and RRT.
@@ -115,19 +116,6 @@ def demonstrations(
     return data
 
 
-def planning_grid(obstacle_map: ObstacleMap, radius: float) -> OccupancyGrid:
-    """The grid for robots of a radius (m): 0.15 m of clearance where there is room, less in a narrow gap.
-
-    Examples:
-        >>> from redig.envs.maps import corridor
-        >>> planning_grid(corridor(1.1), 0.1).resolution, round(planning_grid(corridor(0.3), 0.1).resolution, 3)
-        (0.1, 0.025)
-    """
-    room = obstacle_map.gap / 2 - radius
-    clearance = min(0.15, room / 2)
-    return occupancy_grid(obstacle_map, resolution=min(0.1, room - clearance), inflation=radius + clearance)
-
-
 def _make(
     env: EnvBase,
     num_trajectories: int,
@@ -138,7 +126,6 @@ def _make(
     seed: int,
 ) -> TensorDict:
     scenario = _base_env(env).scenario
-    grid = planning_grid(scenario.obstacle_map, scenario.radius)
     generator = torch.Generator(env.device).manual_seed(seed)
     env.set_seed(seed)
     num_envs, n = env.batch_size[0], scenario.n_robots
@@ -148,29 +135,26 @@ def _make(
         for done in range(0, episodes, num_envs):
             tensordict = env.reset()
             observation = tensordict["agents", "observation"]
-            start = observation[..., :2].flatten(0, 1)
-            goal = start + observation[..., 4:6].flatten(0, 1)
-            paths = []
-            for i, (a, b) in enumerate(zip(start.tolist(), goal.tolist(), strict=True)):
-                paths.append(astar(grid, a, b) if planner == "astar" else rrt(grid, a, b, seed=seed + done * n + i))
-                if (i + 1) % n == 0:
-                    progress.update(int(done + i // n < episodes))
-            own_speed = torch.empty(num_envs, n, device=env.device).uniform_(*speed, generator=generator)
-            tracker = PathTracker(
-                pad_paths(paths).to(env.device).unflatten(0, (num_envs, n)),
-                own_speed,
-                scenario.max_acceleration,
-                scenario.dt,
-            )
-            batches.append(_rollout(env, tensordict, tracker, noise, max_steps, generator))
+            start = observation[..., :2]
+            goal = start + observation[..., 4:6]
+            report = partial(_report, progress, episodes - done)
+            if planner == "virtual_structure":
+                command = plan_together(scenario, start, goal, speed, generator, report)
+            else:
+                command = plan_alone(scenario, start, goal, planner, speed, generator, seed + done * n, report)
+            batches.append(_rollout(env, tensordict, command, noise, max_steps, generator))
     longest = max(batch.shape[1] for batch in batches)
     return torch.cat([pad(batch, [0, 0, 0, longest - batch.shape[1]]) for batch in batches])[:episodes].contiguous()
+
+
+def _report(progress: tqdm, wanted: int, team: int) -> None:
+    progress.update(int(team < wanted))
 
 
 def _rollout(
     env: EnvBase,
     tensordict: TensorDictBase,
-    tracker: PathTracker,
+    tracker: Callable[[Tensor], Tensor],
     noise: float,
     max_steps: int,
     generator: torch.Generator,

@@ -89,3 +89,46 @@ class PathTracker:
         fraction = (along - self.travelled.gather(-1, segment)) / self.lengths.gather(-1, segment).clamp_min(1e-12)
         point = self.paths.gather(-2, pick) + fraction.unsqueeze(-1) * self.segments.gather(-2, pick)
         return point.squeeze(-2)
+
+
+def pad_references(references: Sequence[Tensor]) -> Tensor:
+    """Positions over time ``[T_i, n, 2]`` (m) as one tensor ``[N, max T_i, n, 2]``; the last position is repeated.
+
+    Examples:
+        >>> import torch
+        >>> pad_references([torch.zeros(2, 5, 2), torch.zeros(3, 5, 2)]).shape
+        torch.Size([2, 3, 5, 2])
+    """
+    longest = max(len(reference) for reference in references)
+    return torch.stack([torch.cat([r, r[-1:].expand(longest - len(r), -1, -1)]) for r in references])
+
+
+class ReferenceTracker:
+    """Follow positions planned over time: the planned velocity, plus a share of what is missing to the position.
+
+    Args:
+        references: planned positions of B teams ``[B, T, n, 2]`` (m) at times 0, ``dt``, ...
+        dt: time step (s).
+        gain: velocity for each metre of error (1/s).
+
+    Raises:
+        ValueError: if the shape is not ``[B, T, n, 2]``.
+
+    Examples:
+        >>> import torch
+        >>> tracker = ReferenceTracker(torch.tensor([0.0, 0.1, 0.2])[None, :, None, None].expand(1, 3, 1, 2), dt=0.1)
+        >>> tracker(torch.tensor([[[0.0, 0.1]]]), step=torch.tensor([0]))
+        tensor([[[1.0000, 0.7000]]])
+    """
+
+    def __init__(self, references: Tensor, dt: float = 0.1, gain: float = 3.0) -> None:
+        if references.ndim != 4 or references.shape[-1] != 2:
+            raise ValueError(f"references: got shape {list(references.shape)}, expected [B, T, n, 2]")
+        self.references, self.dt, self.gain = references, dt, gain
+
+    def __call__(self, position: Tensor, step: Tensor) -> Tensor:
+        """Velocity commands ``[B, n, 2]`` (m/s) for robots at ``position`` ``[B, n, 2]`` (m) at ``step`` ``[B]``."""
+        team, last = torch.arange(len(position), device=position.device), self.references.shape[1] - 1
+        now = self.references[team, step.clamp(0, last)]
+        following = self.references[team, (step + 1).clamp(0, last)]
+        return (following - now) / self.dt + self.gain * (now - position)
