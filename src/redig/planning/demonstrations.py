@@ -6,6 +6,7 @@ import hashlib
 import math
 import os
 import warnings
+from dataclasses import fields, is_dataclass
 from pathlib import Path
 from typing import Any
 
@@ -15,7 +16,9 @@ from torch import Tensor
 from torchrl.envs import EnvBase, TransformedEnv
 from tqdm import tqdm
 
+from redig.envs.map_batch import map_at
 from redig.envs.maps import ObstacleMap
+from redig.envs.occupancy import OccupancyMap
 from redig.envs.seeding import preserve_rng_state
 from redig.files import replacing
 from redig.planning.astar import astar
@@ -115,7 +118,7 @@ def demonstrations(
     return data
 
 
-def planning_grid(obstacle_map: ObstacleMap, radius: float) -> OccupancyGrid:
+def planning_grid(obstacle_map: ObstacleMap | OccupancyMap, radius: float) -> OccupancyGrid:
     """The grid for robots of a radius (m): 0.15 m of clearance where there is room, less in a narrow gap.
 
     Examples:
@@ -138,10 +141,10 @@ def _make(
     seed: int,
 ) -> TensorDict:
     scenario = _base_env(env).scenario
-    grid = planning_grid(scenario.obstacle_map, scenario.radius)
     generator = torch.Generator(env.device).manual_seed(seed)
     env.set_seed(seed)
     num_envs, n = env.batch_size[0], scenario.n_robots
+    grids: dict[int, OccupancyGrid] = {}  # one for each map, made when it is first needed
     episodes = math.ceil(num_trajectories / n)
     batches = []
     with tqdm(total=episodes, desc=f"demonstrations ({planner})", unit="team", disable=None) as progress:
@@ -152,6 +155,10 @@ def _make(
             goal = start + observation[..., 4:6].flatten(0, 1)
             paths = []
             for i, (a, b) in enumerate(zip(start.tolist(), goal.tolist(), strict=True)):
+                here = map_at(scenario.obstacle_map, i // n)
+                if id(here) not in grids:
+                    grids[id(here)] = planning_grid(here, scenario.radius)
+                grid = grids[id(here)]
                 paths.append(astar(grid, a, b) if planner == "astar" else rrt(grid, a, b, seed=seed + done * n + i))
                 if (i + 1) % n == 0:
                     progress.update(int(done + i // n < episodes))
@@ -202,7 +209,6 @@ def _base_env(env: EnvBase) -> EnvBase:
 def _fingerprint(env: EnvBase, settings: dict[str, Any]) -> str:
     """Hash over everything that decides what the demonstrations are."""
     scenario = _base_env(env).scenario
-    obstacle_map = scenario.obstacle_map
     transforms = env.transform.modules() if isinstance(env, TransformedEnv) else []
     parts = (
         VERSION,
@@ -211,11 +217,21 @@ def _fingerprint(env: EnvBase, settings: dict[str, Any]) -> str:
         type(scenario).__qualname__,
         sorted(_plain_attributes(scenario).items()),
         scenario.offsets.tolist(),
-        obstacle_map.obstacles.tolist(),
-        (obstacle_map.gap, obstacle_map.bounds),
+        _plain_map(scenario.obstacle_map),
         [(type(t).__name__, sorted(_plain_attributes(t).items())) for t in transforms],
     )
     return hashlib.sha256(repr(parts).encode()).hexdigest()[:16]
+
+
+def _plain_map(value: Any) -> Any:
+    """Everything that a map consists of, its kind included, as numbers, lists and tuples."""
+    if isinstance(value, Tensor):
+        return value.tolist()
+    if isinstance(value, tuple):
+        return tuple(map(_plain_map, value))
+    if is_dataclass(value):
+        return type(value).__qualname__, *(_plain_map(getattr(value, field.name)) for field in fields(value))
+    return value
 
 
 def _plain_attributes(thing: object) -> dict:
