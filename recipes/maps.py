@@ -91,8 +91,8 @@ def measure(file: Path, starts: int, seed: int, folder: Path) -> None:
         metrics = evaluate(policy, env, seed=seed)
         rows.append({"map": kind, **{name: round(metrics[name], 4) for name in SHOWN}})
         print(rows[-1])
-    with replacing(folder / "zero_shot.csv") as path, open(path, "w", newline="") as file:
-        writer = csv.DictWriter(file, fieldnames=list(rows[0]))
+    with replacing(folder / "zero_shot.csv") as path, open(path, "w", newline="") as sheet:
+        writer = csv.DictWriter(sheet, fieldnames=list(rows[0]))
         writer.writeheader()
         writer.writerows(rows)
     cells = [list(rows[0]), ["---"] * len(rows[0]), *(list(map(str, row.values())) for row in rows)]

@@ -141,8 +141,8 @@ def curve(
         boxes.append((*at(heading, outer + thick / 2), (outer + thick) * math.tan(half), thick / 2, tilt, 0.0))
     for end in (-1, 1):  # a wall across, outside the path, at either end
         heading = end * angle / 2
-        place = at(heading, outer / math.cos(half) + WALL / 2, -end * thick / 2)
-        boxes.append((*place, thick / 2, WALL / 2, side * heading, 0.0))
+        place = at(heading, outer / math.cos(half) + WALL, -end * thick / 2)
+        boxes.append((*place, thick / 2, WALL, side * heading, 0.0))
     away = WALL + max(0.0, -centre)  # and one that closes the way around the inner side
     boxes.append((0.0, side * (centre + away / 2), thick / 2, away / 2, 0.0, 0.0))
     route = [at(-angle / 2 + 2 * i * half, middle) for i in range(count + 1)]
