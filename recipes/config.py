@@ -8,9 +8,11 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Self
 
+from redig.envs.random_maps import MAP_KINDS
+
 # What suits each formation: too much weight, and a team keeps its shape rather than arrive; the bonus hurries it on.
 REWARD: dict[str, dict[str, Any]] = {
-    "wedge": {"formation_weight": 2.5, "arrival_bonus": 20.0},
+    "wedge": {"formation_weight": 3.5, "arrival_bonus": 20.0},
     "line": {"formation_weight": 1.0, "arrival_bonus": 10.0},
     "circle": {"formation_weight": 2.0, "arrival_bonus": 20.0},
 }
@@ -44,6 +46,9 @@ class Task:
     """Robots in the team."""
     formation_width: float = 2.0
     """Width of the formation (m)."""
+    map: str = "corridor"
+    """corridor (of the next two sizes), another kind of redig.envs.MAP_KINDS, of which every team gets its own random
+    map, or the path of a YAML file as ROS map servers write it, with gap and route."""
     corridor_width: float = 1.1
     """Width of the corridor (m)."""
     corridor_length: float = 2.0
@@ -85,15 +90,18 @@ class Task:
     num_starts: int = 256
     """Starts of the final evaluation, never trained on and never used for a choice."""
 
-    def scenario(self) -> dict[str, Any]:
-        """Arguments of :class:`redig.envs.FormationNavigation`."""
+    def scenario(self, split: str = "train") -> dict[str, Any]:
+        """Arguments of :class:`redig.envs.FormationNavigation`; random maps are those of a split."""
         names = (
             "formation", "n_robots", "formation_width", "corridor_width", "corridor_length", "max_speed",
             "max_acceleration", "observe_direction", "formation_reward", "formation_weight", "omega",
             "navigation_reward", "arrival_bonus", "collision_penalty", "proximity_penalty", "collision_terminates",
             "arrival_terminates",
         )  # fmt: skip
-        return {name: getattr(self, name) for name in names}
+        arguments = {name: getattr(self, name) for name in names}
+        if self.map != "corridor":
+            arguments["obstacle_map"] = f"{self.map}:{split}" if self.map in MAP_KINDS else self.map
+        return arguments
 
     def saved(self) -> Self:
         """The configuration of the run in the folder to resume.

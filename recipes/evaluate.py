@@ -16,6 +16,7 @@ from torchrl.envs.utils import ExplorationType
 
 from redig.checkpoint import load_checkpoint
 from redig.envs.factory import make_env
+from redig.envs.random_maps import MAP_KINDS
 from redig.evaluation import evaluate, format_table, rollout_trajectories, write_metrics
 from redig.modules import BestOfN, DiffusionActor
 from redig.policy import build_policy, build_sampler, load_policy, read_header
@@ -40,6 +41,8 @@ class Arguments:
     """Another number of robots."""
     corridor_width: float | None = None
     """Another width of the corridor (m)."""
+    map: str | None = None
+    """Another map: a kind of redig.envs.MAP_KINDS, whose evaluation maps the teams get in turn, or a YAML file."""
     sampler: Literal["ddpm", "ddim", "dpmsolver"] | None = None
     """Another sampler than the one that the policy was trained with."""
     sampling_steps: int | None = None
@@ -69,6 +72,9 @@ def main(arguments: Arguments) -> dict[str, float]:
     _, scenario = read_header(arguments.policy)
     changes = {name: getattr(arguments, name) for name in ("formation", "n_robots", "corridor_width")}
     scenario |= {name: value for name, value in changes.items() if value is not None}
+    if (place := arguments.map or scenario.get("obstacle_map")) is not None:
+        kind = place.removesuffix(":train")
+        scenario["obstacle_map"] = f"{kind}:evaluation" if kind in MAP_KINDS else place
     env = make_env(arguments.starts, **scenario)
     policy = load(arguments, env.observation_spec["agents", "observation"].shape[-1])
     driver: TensorDictModuleBase = policy

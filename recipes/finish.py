@@ -26,7 +26,8 @@ def score(metrics: dict[str, float]) -> float:
 
 def finish(run: Run, config: Task) -> dict[str, float]:
     """Evaluate the cloned, the last and the best policy of a run, and leave its metrics and pictures."""
-    env = make_env(config.num_starts, **config.scenario())
+    scenario = config.scenario("evaluation")
+    env = make_env(config.num_starts, **scenario)
     results = {}
     for name in ("cloned", "last", "policy"):
         if name == "cloned" and not (run.folder / "cloned.safetensors").exists():
@@ -38,8 +39,6 @@ def finish(run: Run, config: Task) -> dict[str, float]:
     others = {f"{name}_{key}": value for name in results if name != "policy" for key, value in results[name].items()}
     write_metrics(run.folder / "metrics.json", {**metrics, **others})
     plot_learning_curves(run.folder / "learning_curve.png", run.evaluations)
-    draw_crossing(
-        run.folder, load_policy(run.folder / "policy.safetensors"), make_env(1, **config.scenario()), TEST_SEED
-    )
+    draw_crossing(run.folder, load_policy(run.folder / "policy.safetensors"), make_env(1, **scenario), TEST_SEED)
     print(f"\neverything is in {run.folder} ({platform.machine()}, {torch.get_num_threads()} threads)")
     return metrics

@@ -9,9 +9,10 @@ from torch import Tensor
 
 from redig.baselines.episode import EpisodePlanner
 from redig.envs.dynamics import limit_norm
+from redig.envs.map_batch import map_at
 from redig.envs.navigation import FormationNavigation
 from redig.planning.astar import astar
-from redig.planning.plans import map_of, planning_grid
+from redig.planning.plans import planning_grid
 from redig.planning.tracking import PathTracker, pad_paths
 
 
@@ -87,7 +88,7 @@ class LeaderFollower(EpisodePlanner):
         self.goal[teams], self.pace[teams] = goal[:, self.leader], 1.0
         starts, ends = position[:, self.leader].tolist(), goal[:, self.leader].tolist()
         for team, start, end in zip(teams.tolist(), starts, ends, strict=True):
-            self._paths[team] = astar(self.grid_of(map_of(self.scenario, team)), start, end)
+            self._paths[team] = astar(self.grid_of(map_at(self.scenario.obstacle_map, team)), start, end)
         paths = pad_paths(self._paths).to(position.device)
         speed = torch.full((num_teams,), self.speed, device=position.device)
         self._tracker = PathTracker(paths, speed, self.scenario.max_acceleration, self.scenario.dt)

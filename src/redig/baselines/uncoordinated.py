@@ -8,9 +8,10 @@ import torch
 from torch import Tensor
 
 from redig.baselines.episode import EpisodePlanner
+from redig.envs.map_batch import map_at
 from redig.envs.navigation import FormationNavigation
 from redig.planning.astar import astar
-from redig.planning.plans import map_of, planning_grid
+from redig.planning.plans import planning_grid
 from redig.planning.tracking import PathTracker, pad_paths
 
 
@@ -45,7 +46,7 @@ class UncoordinatedPlanner(EpisodePlanner):
         if len(self._plans) != num_teams * n:
             self._plans = [position.new_empty(0)] * num_teams * n
         for team, starts, ends in zip(teams.tolist(), position.tolist(), goal.tolist(), strict=True):
-            grid = self.grid_of(map_of(self.scenario, team))
+            grid = self.grid_of(map_at(self.scenario.obstacle_map, team))
             self._plans[team * n : (team + 1) * n] = [astar(grid, a, b) for a, b in zip(starts, ends, strict=True)]
         paths = pad_paths(self._plans).to(position.device).unflatten(0, (num_teams, n))
         speed = torch.full(paths.shape[:2], self.speed, device=position.device)

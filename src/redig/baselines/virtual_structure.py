@@ -7,8 +7,8 @@ from functools import lru_cache
 from torch import Tensor
 
 from redig.baselines.episode import EpisodePlanner
+from redig.envs.map_batch import map_at
 from redig.envs.navigation import FormationNavigation
-from redig.planning.plans import map_of
 from redig.planning.tracking import ReferenceTracker, pad_references
 from redig.planning.virtual_structure import StructurePlanner
 
@@ -41,7 +41,9 @@ class VirtualStructure(EpisodePlanner):
         if not 0 < self.max_speed <= scenario.max_speed:
             raise ValueError(f"max_speed: got {max_speed}, must be greater than 0 and at most {scenario.max_speed} m/s")
         shape = (scenario.formation, scenario.offsets.cpu(), scenario.radius)
-        StructurePlanner(map_of(scenario, 0), *shape, **options)  # checks the options now rather than in an episode
+        StructurePlanner(
+            map_at(scenario.obstacle_map, 0), *shape, **options
+        )  # checks the options now rather than in an episode
         self.structure_of = lru_cache(maxsize=None)(
             lambda team_map: StructurePlanner(team_map.to("cpu"), *shape, **options)
         )
@@ -53,7 +55,7 @@ class VirtualStructure(EpisodePlanner):
         if len(self._plans) != num_teams:
             self._plans = [position.new_empty(0)] * num_teams
         for team, start, end in zip(teams.tolist(), position.cpu(), goal.cpu(), strict=True):
-            self._plans[team] = self.structure_of(map_of(self.scenario, team))(start, end, *limits)
+            self._plans[team] = self.structure_of(map_at(self.scenario.obstacle_map, team))(start, end, *limits)
         self._tracker = ReferenceTracker(pad_references(self._plans).to(position.device), self.scenario.dt)
 
     def command(self, position: Tensor, velocity: Tensor, step: Tensor) -> Tensor:

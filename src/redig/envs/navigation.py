@@ -10,7 +10,10 @@ from vmas.simulator.scenario import BaseScenario
 from redig.envs import rewards
 from redig.envs.dynamics import VelocityCommand, leave_walls, part_robots
 from redig.envs.formations import formation_offsets, pairwise_distances
-from redig.envs.maps import ObstacleMap, corridor
+from redig.envs.map_batch import AnyMap, check_map, map_at
+from redig.envs.maps import corridor
+from redig.envs.random_maps import named_map
+from redig.envs.routes import route_poses, turned_along
 
 FORMATION_REWARDS = ("spring_damper", "spring_damper_bonus", "scaled", "slanted", "none")
 NAVIGATION_REWARDS = ("goal_speed", "progress")
@@ -27,16 +30,21 @@ class FormationNavigation(BaseScenario):
 
     * ``formation``, ``n_robots``, ``formation_width`` (m): the shape, see
       :func:`~redig.envs.formations.formation_offsets`.
-    * ``corridor_width``, ``corridor_length`` (m), ``corridor_angle`` (rad): the default map;
-      ``obstacle_map`` (:class:`~redig.envs.maps.ObstacleMap`) replaces it.
+    * ``corridor_width``, ``corridor_length`` (m), ``corridor_angle`` (rad): the default map. ``obstacle_map`` replaces
+      it: an :class:`~redig.envs.ObstacleMap`, an :class:`~redig.envs.OccupancyMap`, a :class:`~redig.envs.MapBatch`
+      with a map for each environment, or a name, see :func:`~redig.envs.named_map`.
     * ``start_distance`` (m): from the map's centre to the centre of the start and of the goal formation, along
-      ``corridor_angle``. ``position_jitter`` (m) and ``heading_jitter`` (rad): half ranges of what is added to each.
+      ``corridor_angle``; on a map with a route, its ends say where both are and how they head. ``position_jitter`` (m)
+      and ``heading_jitter`` (rad): half ranges of what is added to each.
     * ``radius`` (m), ``max_speed`` (m/s), ``max_acceleration`` (m/s²), ``dt`` (s): the robots.
     * ``observe_direction``: add the unit vector to the nearest obstacle (9 numbers); ``False`` gives the paper's 7.
     * ``formation_reward``: one of ``spring_damper`` (Eq. 29), ``spring_damper_bonus``, ``scaled``, ``slanted``,
       ``none``; ``formation_weight``; ``omega``. The frame of ``scaled`` and ``slanted`` is the goal formation's
-      heading, so that the goal itself is a perfect formation.
-    * ``navigation_reward``: ``goal_speed`` (Eq. 30) or ``progress``; ``arrival_bonus``, ``goal_radius`` (m);
+      heading, so that the goal itself is a perfect formation. On a route it is turned back by as much as the route
+      turns between the team's centroid and the goal, so that a team is squeezed across the path wherever it is; on a
+      straight one that is nothing. The contextual formation integrity has no frame.
+    * ``navigation_reward``: ``goal_speed`` (Eq. 30) or ``progress``, both as the crow flies: along an arc of less than
+      half a circle every step still pays; ``arrival_bonus``, ``goal_radius`` (m);
       ``collision_penalty``; ``proximity_penalty`` and ``proximity_margin`` (m), a ramp before contact.
     * ``collision_terminates``, ``arrival_terminates``: what ends the task of one robot (``info["terminated"]``).
     * ``hold_steps``: steps for which the team holds at its goals before the episode ends.
@@ -49,8 +57,8 @@ class FormationNavigation(BaseScenario):
     ``collision``, ``arrived``, ``terminated`` (0 or 1).
 
     Raises:
-        ValueError: for an unknown name, a size that is not positive, a corridor too narrow for one robot, or a start or
-            goal inside a wall.
+        ValueError: for an unknown name, a size that is not positive, a passage too narrow for one robot, a number of
+            maps that is not that of the environments, or a start or goal inside a wall.
         TypeError: for an unknown keyword argument.
 
     Examples:
@@ -61,17 +69,15 @@ class FormationNavigation(BaseScenario):
         torch.Size([4, 3, 9])
     """
 
-    obstacle_map: ObstacleMap
+    obstacle_map: AnyMap
 
     def make_world(self, batch_dim: int, device: torch.device, **kwargs) -> World:
         """Build the team and its map (called by VMAS)."""
-        self._read_arguments(kwargs)
+        self._read_arguments(kwargs, batch_dim)
         offsets = formation_offsets(self.formation, self.n_robots, self.formation_width)
         self.offsets = offsets.to(device)
         self.desired = pairwise_distances(self.offsets)
         self.obstacle_map = self.obstacle_map.to(device)
-        angle = torch.tensor(self.corridor_angle, device=device)
-        self.axis = torch.stack([angle.cos(), angle.sin()])
         world = World(batch_dim, device, dt=self.dt, drag=0.0)
         for i in range(self.n_robots):
             world.add_agent(
@@ -87,14 +93,15 @@ class FormationNavigation(BaseScenario):
                 )
             )
         batch = (batch_dim, self.n_robots)
+        self.poses, self.ahead = self._start_and_goal(batch_dim, device)
         self.goal = torch.zeros(*batch, 2, device=device)
-        self.direction = self.axis.expand(batch_dim, 2).clone()
+        self.direction = torch.zeros(batch_dim, 2, device=device)
         self.arrived = torch.zeros(batch, dtype=torch.bool, device=device)
         self.held = torch.zeros(batch_dim, dtype=torch.long, device=device)
         self._quantities: dict[str, Tensor] | None = None
         return world
 
-    def _read_arguments(self, kwargs: dict) -> None:
+    def _read_arguments(self, kwargs: dict, batch_dim: int) -> None:
         take = kwargs.pop
         self.formation = take("formation", "wedge")
         self.n_robots = take("n_robots", 5)
@@ -141,26 +148,28 @@ class FormationNavigation(BaseScenario):
                 f"corridor_width: got {corridor_width} m, too narrow for one robot of radius {self.radius} m; "
                 f"it must be greater than {2 * self.radius} m"
             )
-        obstacle_map: ObstacleMap | None = take("obstacle_map", None)
-        self.obstacle_map = obstacle_map or corridor(corridor_width, corridor_length, self.corridor_angle)
+        obstacle_map = take("obstacle_map", None)
+        if obstacle_map is None:
+            obstacle_map = corridor(corridor_width, corridor_length, self.corridor_angle)
+        self.obstacle_map = named_map(obstacle_map, batch_dim) if isinstance(obstacle_map, str) else obstacle_map
+        check_map(self.obstacle_map, batch_dim, self.radius)
         if kwargs:
             raise TypeError(f"unknown argument(s) of FormationNavigation: {', '.join(sorted(kwargs))}")
+
+    def _start_and_goal(self, batch_dim: int, device: torch.device) -> tuple[list[Tensor], tuple[float, float]]:
+        """Poses of start and goal ``[B, 3]`` and how far ahead of them (m) the formations stand."""
+        if self.obstacle_map.route is not None:
+            return [pose.expand(batch_dim, 3) for pose in route_poses(self.obstacle_map.route)], (0.0, 0.0)
+        centre = torch.tensor([0.0, 0.0, self.corridor_angle], device=device).expand(batch_dim, 3)
+        return [centre, centre], (-self.start_distance, self.start_distance)
 
     def reset_world_at(self, env_index: int | None = None) -> None:
         """Draw new start and goal formations for one environment, or for all."""
         index = slice(None) if env_index is None else slice(env_index, env_index + 1)
-        batch = self.goal[index].shape[0]
-        _, start = self._formation_at(-self.start_distance, batch)
-        goal_heading, goal = self._formation_at(self.start_distance, batch)
-        places = torch.stack([start, goal])
-        inside = self.obstacle_map.signed_distance(places) < self.radius
-        if inside.any():
-            which, env, robot = inside.nonzero()[0].tolist()
-            raise ValueError(
-                f"start_distance: with {self.start_distance} m the {('start', 'goal')[which]} of robot {robot} lies "
-                f"inside a wall, at {[round(x, 2) for x in places[which, env, robot].tolist()]} m; choose a larger "
-                "distance or less jitter"
-            )
+        _, start = self._formation_at(self.poses[0][index], self.ahead[0])
+        goal_heading, goal = self._formation_at(self.poses[1][index], self.ahead[1])
+        here = self.obstacle_map if env_index is None else map_at(self.obstacle_map, env_index)
+        self._check_places(torch.stack([start, goal]), here)
         self.direction[index] = goal_heading
         self.goal[index] = goal
         self.arrived[index] = False
@@ -172,13 +181,26 @@ class FormationNavigation(BaseScenario):
             )
         self._quantities = None
 
-    def _formation_at(self, distance: float, batch: int) -> tuple[Tensor, Tensor]:
-        """Headings ``[batch, 2]`` and robots' places ``[batch, n, 2]`` of randomised formations along the corridor."""
-        device = self.axis.device
-        along = distance + self.position_jitter * (2 * torch.rand(batch, 1, device=device) - 1)
-        across = self.position_jitter * (2 * torch.rand(batch, 1, device=device) - 1)
-        centre = along * self.axis + across * torch.stack([-self.axis[1], self.axis[0]])
-        heading = self.corridor_angle + self.heading_jitter * (2 * torch.rand(batch, 1, device=device) - 1)
+    def _check_places(self, places: Tensor, obstacle_map: AnyMap) -> None:
+        """Raise if a start or a goal, ``[2, b, n, 2]``, lies inside a wall."""
+        inside = obstacle_map.signed_distance(places) < self.radius
+        if inside.any():
+            which, env, robot = inside.nonzero()[0].tolist()
+            cause = f"start_distance: with {self.start_distance} m" if obstacle_map.route is None else "route: with it"
+            at = [round(x, 2) for x in places[which, env, robot].tolist()]
+            raise ValueError(
+                f"{cause} the {('start', 'goal')[which]} of robot {robot} lies inside a wall, at {at} m; choose a "
+                "larger distance or less jitter"
+            )
+
+    def _formation_at(self, pose: Tensor, ahead: float) -> tuple[Tensor, Tensor]:
+        """Headings ``[b, 2]`` and robots' places ``[b, n, 2]`` of randomised formations ahead of poses ``[b, 3]``."""
+        centre, heading = pose[:, :2], pose[:, 2:]
+        axis = torch.cat([heading.cos(), heading.sin()], -1)
+        along = ahead + self.position_jitter * (2 * torch.rand_like(heading) - 1)
+        across = self.position_jitter * (2 * torch.rand_like(heading) - 1)
+        centre = centre + along * axis + across * torch.stack([-axis[:, 1], axis[:, 0]], -1)
+        heading = heading + self.heading_jitter * (2 * torch.rand_like(heading) - 1)
         cos, sin = heading.cos(), heading.sin()
         forward, left = self.offsets.unbind(-1)
         place = torch.stack([cos * forward - sin * left, sin * forward + cos * left], -1)
@@ -236,9 +258,9 @@ class FormationNavigation(BaseScenario):
 
     def _formation_reward(self, position: Tensor, velocity: Tensor) -> Tensor:
         if self.formation_reward == "scaled":
-            bonus = rewards.scaled_formation_bonus(position, self.offsets, self.direction)
+            bonus = rewards.scaled_formation_bonus(position, self.offsets, self._travel_direction(position))
         elif self.formation_reward == "slanted":
-            bonus = rewards.slanted_formation_bonus(position, self.offsets, self.direction)
+            bonus = rewards.slanted_formation_bonus(position, self.offsets, self._travel_direction(position))
         elif self.formation_reward == "spring_damper_bonus":
             bonus = rewards.spring_damper_bonus(position, velocity, self.desired, self.omega)
         elif self.formation_reward == "spring_damper":
@@ -247,6 +269,12 @@ class FormationNavigation(BaseScenario):
         else:
             bonus = position.new_zeros(position.shape[:2])
         return self.formation_weight * bonus
+
+    def _travel_direction(self, position: Tensor) -> Tensor:
+        """Where a formation should head ``[B, 2]``: as at the goal, less what the route still turns until there."""
+        if self.obstacle_map.route is None:
+            return self.direction
+        return turned_along(self.obstacle_map.route, position.mean(-2), self.direction)
 
     @property
     def quantities(self) -> dict[str, Tensor]:

@@ -69,7 +69,7 @@ def travel_time(arrived: Tensor, dt: float) -> Tensor:
     return last.masked_fill(~arrived.any(-2).all(-1), float("nan"))
 
 
-def gap_term(position: Tensor, xi: float, delta: float, literal: bool = False) -> Tensor:
+def gap_term(position: Tensor, xi: float | Tensor, delta: float, literal: bool = False) -> Tensor:
     """How well the team's size fits the gap: the first term of the CFI (Appendix F.5), in [0, 1].
 
     With r the team's maximum radius, the largest distance of a robot from the centroid, the default is
@@ -79,7 +79,7 @@ def gap_term(position: Tensor, xi: float, delta: float, literal: bool = False) -
 
     Args:
         position: ``[*B, n, 2]`` (m).
-        xi: corridor width with a safety margin (m), such as the gap less a robot's diameter.
+        xi: corridor width with a safety margin (m), such as the gap less a robot's diameter; broadcasts against ``*B``.
         delta: tolerance (m).
         literal: the formula as printed, clamped.
 
@@ -106,7 +106,7 @@ def gap_term(position: Tensor, xi: float, delta: float, literal: bool = False) -
 
 
 def contextual_formation_integrity(
-    name: str, position: Tensor, xi: float, delta: float, w: float = 0.5, literal: bool = False
+    name: str, position: Tensor, xi: float | Tensor, delta: float, w: float = 0.5, literal: bool = False
 ) -> Tensor:
     """Contextual formation integrity (Appendix F.5): ``CFI = w * gap_term + (1 - w) * tau``, in [0, 1].
 

@@ -7,6 +7,7 @@ import math
 import os
 import warnings
 from collections.abc import Callable
+from dataclasses import fields, is_dataclass
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -186,7 +187,6 @@ def _base_env(env: EnvBase) -> EnvBase:
 def _fingerprint(env: EnvBase, settings: dict[str, Any]) -> str:
     """Hash over everything that decides what the demonstrations are."""
     scenario = _base_env(env).scenario
-    obstacle_map = scenario.obstacle_map
     transforms = env.transform.modules() if isinstance(env, TransformedEnv) else []
     parts = (
         VERSION,
@@ -195,11 +195,21 @@ def _fingerprint(env: EnvBase, settings: dict[str, Any]) -> str:
         type(scenario).__qualname__,
         sorted(_plain_attributes(scenario).items()),
         scenario.offsets.tolist(),
-        obstacle_map.obstacles.tolist(),
-        (obstacle_map.gap, obstacle_map.bounds),
+        _plain_map(scenario.obstacle_map),
         [(type(t).__name__, sorted(_plain_attributes(t).items())) for t in transforms],
     )
     return hashlib.sha256(repr(parts).encode()).hexdigest()[:16]
+
+
+def _plain_map(value: Any) -> Any:
+    """Everything that a map consists of, its kind included, as numbers, lists and tuples."""
+    if isinstance(value, Tensor):
+        return value.tolist()
+    if isinstance(value, tuple):
+        return tuple(map(_plain_map, value))
+    if is_dataclass(value):
+        return type(value).__qualname__, *(_plain_map(getattr(value, field.name)) for field in fields(value))
+    return value
 
 
 def _plain_attributes(thing: object) -> dict:

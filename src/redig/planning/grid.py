@@ -11,6 +11,7 @@ import torch
 from torch import Tensor
 
 from redig.envs.maps import ObstacleMap
+from redig.envs.occupancy import OccupancyMap
 
 Point = tuple[float, float]
 
@@ -136,7 +137,9 @@ class OccupancyGrid:
         return (point[0] - self.origin[0]) / self.resolution + 1, (point[1] - self.origin[1]) / self.resolution + 1
 
 
-def occupancy_grid(obstacle_map: ObstacleMap, resolution: float = 0.1, inflation: float = 0.25) -> OccupancyGrid:
+def occupancy_grid(
+    obstacle_map: ObstacleMap | OccupancyMap, resolution: float = 0.1, inflation: float = 0.25
+) -> OccupancyGrid:
     """The grid over the bounds of a map: a cell is occupied if its centre is within ``inflation`` of an obstacle.
 
     Args:

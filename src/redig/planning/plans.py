@@ -9,8 +9,10 @@ from functools import lru_cache
 import torch
 from torch import Tensor
 
+from redig.envs.map_batch import map_at
 from redig.envs.maps import ObstacleMap
 from redig.envs.navigation import FormationNavigation
+from redig.envs.occupancy import OccupancyMap
 from redig.planning.astar import astar
 from redig.planning.grid import OccupancyGrid, occupancy_grid
 from redig.planning.rrt import rrt
@@ -20,7 +22,7 @@ from redig.planning.virtual_structure import StructurePlanner
 CLEARANCE = 0.05  # m, that a virtual structure keeps where its robots are disturbed
 
 
-def planning_grid(obstacle_map: ObstacleMap, radius: float) -> OccupancyGrid:
+def planning_grid(obstacle_map: ObstacleMap | OccupancyMap, radius: float) -> OccupancyGrid:
     """The grid for robots of a radius (m): 0.15 m of clearance where there is room, less in a narrow gap.
 
     Examples:
@@ -31,11 +33,6 @@ def planning_grid(obstacle_map: ObstacleMap, radius: float) -> OccupancyGrid:
     room = obstacle_map.gap / 2 - radius
     clearance = min(0.15, room / 2)
     return occupancy_grid(obstacle_map, resolution=min(0.1, room - clearance), inflation=radius + clearance)
-
-
-def map_of(scenario: FormationNavigation, team: int) -> ObstacleMap:
-    """The map that a team of a scenario drives on: one and the same for all."""
-    return scenario.obstacle_map
 
 
 def plan_alone(
@@ -67,7 +64,7 @@ def plan_alone(
     num_envs, n = start.shape[:2]
     paths = []
     for i, (a, b) in enumerate(zip(start.flatten(0, 1).tolist(), goal.flatten(0, 1).tolist(), strict=True)):
-        grid = grid_of(map_of(scenario, i // n))
+        grid = grid_of(map_at(scenario.obstacle_map, i // n))
         paths.append(astar(grid, a, b) if planner == "astar" else rrt(grid, a, b, seed=seed + i))
         if (i + 1) % n == 0:
             report(i // n)
@@ -96,7 +93,7 @@ def plan_together(
     team_speed = torch.empty(len(start), device=start.device).uniform_(*speed, generator=generator)
     references = []
     for i, (a, b, limit) in enumerate(zip(start.cpu(), goal.cpu(), team_speed.tolist(), strict=True)):
-        structure = structure_of(map_of(scenario, i))
+        structure = structure_of(map_at(scenario.obstacle_map, i))
         references.append(structure(a, b, limit, scenario.max_acceleration, scenario.dt))
         report(i)
     tracker = ReferenceTracker(pad_references(references).to(start.device), scenario.dt)

@@ -10,6 +10,7 @@ import imageio.v2 as imageio
 from torch import Tensor
 
 from redig.envs.maps import ObstacleMap
+from redig.envs.occupancy import OccupancyMap
 from redig.files import replacing
 from redig.viz.canvas import BLOCK, TeamCanvas
 from redig.viz.scene import VIDEO_SUFFIXES, check_suffix, check_trajectory, view
@@ -19,7 +20,7 @@ def animate(
     path: str | os.PathLike,
     position: Tensor,
     formation: str,
-    obstacle_map: ObstacleMap,
+    obstacle_map: ObstacleMap | OccupancyMap,
     goal: Tensor | None = None,
     radius: float = 0.1,
     dt: float = 0.1,

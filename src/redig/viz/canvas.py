@@ -9,6 +9,7 @@ from matplotlib.patches import Circle
 from numpy.typing import NDArray
 
 from redig.envs.maps import ObstacleMap
+from redig.envs.occupancy import OccupancyMap
 from redig.viz.scene import INK, SHAPE, draw_map, formation_outline, robot_style
 
 DPI = 128
@@ -42,7 +43,7 @@ class TeamCanvas:
         region: tuple[float, float, float, float],
         n: int,
         formation: str,
-        obstacle_map: ObstacleMap,
+        obstacle_map: ObstacleMap | OccupancyMap,
         goal: NDArray | None = None,
         radius: float = 0.1,
     ) -> None:

@@ -8,12 +8,15 @@ from pathlib import Path
 import numpy as np
 import torch
 from matplotlib.axes import Axes
+from matplotlib.colors import ListedColormap
 from matplotlib.patches import Polygon
+from matplotlib.transforms import Affine2D
 from numpy.typing import NDArray
 from torch import Tensor
 
 from redig.envs.formations import formation_offsets
 from redig.envs.maps import ObstacleMap
+from redig.envs.occupancy import OccupancyMap
 
 # Okabe and Ito's palette for colour-blind readers, without its black (walls, text) and its yellow (too pale in print)
 PALETTE = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9")
@@ -83,7 +86,7 @@ def view(position: NDArray, goal: NDArray | None, margin: float = 0.5) -> tuple[
     return float(x_min), float(x_max), float(y_min), float(y_max)
 
 
-def draw_map(axes: Axes, obstacle_map: ObstacleMap, region: tuple[float, float, float, float]) -> None:
+def draw_map(axes: Axes, obstacle_map: ObstacleMap | OccupancyMap, region: tuple[float, float, float, float]) -> None:
     """Fill the obstacles and set up axes in metres that show ``region``.
 
     Examples:
@@ -94,6 +97,31 @@ def draw_map(axes: Axes, obstacle_map: ObstacleMap, region: tuple[float, float, 
         >>> len(axes.patches)  # a wall on either side
         2
     """
+    if isinstance(obstacle_map, OccupancyMap):
+        _draw_cells(axes, obstacle_map)
+    else:
+        _draw_boxes(axes, obstacle_map)
+    axes.set(xlim=region[:2], ylim=region[2:], aspect="equal", xlabel="x (m)", ylabel="y (m)")
+    axes.tick_params(labelsize=8)
+
+
+def _draw_cells(axes: Axes, grid: OccupancyMap) -> None:
+    x, y, yaw = grid.origin
+    height, width = grid.occupied.shape
+    picture = axes.imshow(
+        grid.occupied.cpu().numpy(),
+        cmap=ListedColormap(["none", WALL]),
+        origin="lower",
+        extent=(0, width * grid.resolution, 0, height * grid.resolution),
+        interpolation="none",
+        vmin=0,
+        vmax=1,
+        zorder=1,
+    )
+    picture.set_transform(Affine2D().rotate(yaw).translate(x, y) + axes.transData)
+
+
+def _draw_boxes(axes: Axes, obstacle_map: ObstacleMap) -> None:
     quarter = np.linspace(0, np.pi / 2, 17)
     turn = np.concatenate([quarter + k * np.pi / 2 for k in range(4)])
     corner = np.repeat([[1, 1], [-1, 1], [-1, -1], [1, -1]], len(quarter), axis=0)
@@ -102,8 +130,6 @@ def draw_map(axes: Axes, obstacle_map: ObstacleMap, region: tuple[float, float, 
         cos, sin = np.cos(heading), np.sin(heading)
         outline = local @ np.array([[cos, sin], [-sin, cos]]) + (x, y)
         axes.add_patch(Polygon(outline, facecolor=WALL, edgecolor=SHAPE, linewidth=0.8, zorder=1))
-    axes.set(xlim=region[:2], ylim=region[2:], aspect="equal", xlabel="x (m)", ylabel="y (m)")
-    axes.tick_params(labelsize=8)
 
 
 def check_suffix(path: str | os.PathLike, allowed: tuple[str, ...]) -> Path:

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from redig.envs.maps import ObstacleMap
+from redig.envs.occupancy import OccupancyMap
 from redig.files import replacing
 from redig.viz.scene import (
     IMAGE_SUFFIXES,
@@ -33,7 +34,7 @@ def plot_trajectories(
     path: str | os.PathLike,
     position: Tensor,
     formation: str,
-    obstacle_map: ObstacleMap,
+    obstacle_map: ObstacleMap | OccupancyMap,
     goal: Tensor | None = None,
     radius: float = 0.1,
 ) -> None:
