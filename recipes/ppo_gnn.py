@@ -101,7 +101,7 @@ def train(config: PPOConfig) -> dict[str, float]:
         for batch in minibatches(advantages(loss, data), config.epochs, config.batch_size):
             losses = loss_terms(loss, batch)
             wanted = ("loss_critic",) if i < config.value_rounds else ("loss_objective", "loss_entropy", "loss_critic")
-            run.step(sum(losses[name] for name in wanted), optimizer, config.grad_norm, "loss")
+            run.step(torch.stack([losses[name] for name in wanted]).sum(), optimizer, config.grad_norm, "loss")
         run.figures |= {name: value.item() for name, value in losses.items()}
         run.figures["frames/s"] = len(data) * config.horizon / (time.perf_counter() - started)
         run.log(run.figures, i + 1, "train/")

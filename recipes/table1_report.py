@@ -51,15 +51,11 @@ PAPER = {  # SR (%), TT (s), CFI (%) at 0.5, 0.1 and 0.03: the paper's Table 1
 def write_report(out: Path, done: Sequence[Job]) -> str:
     """Write ``seeds.csv``, one row a run, and ``table.md``; returns the table."""
     starts = {job: read_starts(job.folder / job.starts_file) for job in done}
-    rows = []
+    rows: list[dict[str, str | float]] = []
     for job, metrics in starts.items():
-        means = {name: nanmean(values) for name, values in metrics.items()}
-        seconds = round(job.seconds(), 1)
-        rows.append(
-            {"method": job.method, "formation": job.formation, "seed": "" if job.seed is None else job.seed}
-            | {"frames": job.frames(), "seconds": seconds, "starts": len(metrics["success_rate"])}
-            | means
-        )
+        run = {"method": job.method, "formation": job.formation, "seed": "" if job.seed is None else str(job.seed)}
+        cost = {"frames": job.frames(), "seconds": round(job.seconds(), 1), "starts": len(metrics["success_rate"])}
+        rows.append({**run, **cost, **{name: nanmean(values) for name, values in metrics.items()}})
     with replacing(out / "seeds.csv") as unfinished, open(unfinished, "w", newline="") as file:
         writer = csv.DictWriter(file, list(rows[0]) if rows else [])
         writer.writeheader()

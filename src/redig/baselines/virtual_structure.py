@@ -8,7 +8,9 @@ from torch import Tensor
 
 from redig.baselines.episode import EpisodePlanner
 from redig.envs.map_batch import map_at
+from redig.envs.maps import ObstacleMap
 from redig.envs.navigation import FormationNavigation
+from redig.envs.occupancy import OccupancyMap
 from redig.planning.tracking import ReferenceTracker, pad_references
 from redig.planning.virtual_structure import StructurePlanner
 
@@ -40,13 +42,13 @@ class VirtualStructure(EpisodePlanner):
         self.max_speed = scenario.max_speed if max_speed is None else max_speed
         if not 0 < self.max_speed <= scenario.max_speed:
             raise ValueError(f"max_speed: got {max_speed}, must be greater than 0 and at most {scenario.max_speed} m/s")
-        shape = (scenario.formation, scenario.offsets.cpu(), scenario.radius)
-        StructurePlanner(
-            map_at(scenario.obstacle_map, 0), *shape, **options
-        )  # checks the options now rather than in an episode
-        self.structure_of = lru_cache(maxsize=None)(
-            lambda team_map: StructurePlanner(team_map.to("cpu"), *shape, **options)
-        )
+
+        def structure(team_map: ObstacleMap | OccupancyMap) -> StructurePlanner:
+            offsets = scenario.offsets.cpu()
+            return StructurePlanner(team_map.to("cpu"), scenario.formation, offsets, scenario.radius, **options)
+
+        structure(map_at(scenario.obstacle_map, 0))  # checks the options now rather than in an episode
+        self.structure_of = lru_cache(maxsize=None)(structure)
         self._plans: list[Tensor] = []
 
     def begin(self, teams: Tensor, position: Tensor, goal: Tensor, num_teams: int) -> None:
