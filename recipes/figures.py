@@ -32,7 +32,7 @@ SUFFIXES = (".pdf", ".png")
 WIDTHS = {"one": ONE_COLUMN, "two": TWO_COLUMNS}
 MOMENTS = {"before (20 % of the way)": 0.2, "inside (50 %)": 0.5, "behind (80 %)": 0.8}
 ENTRANCE = 0.35  # share of the way at which the denoising is shown: a wedge enters the default corridor
-FRAMES = 26  # of the film, at most
+FRAMES, FILM_CHAINS = 21, 64  # of a film, at most
 
 
 @dataclass
@@ -149,11 +149,16 @@ def draw_importance(arguments: Arguments, crossings: dict[str, Crossing]) -> Non
     """Importance of messages in the first policy's situations, mean over the starts, Fig. 6."""
     first = next(iter(crossings.values()))
     situations = [situation(first, share) for share in MOMENTS.values()]
+    for (_, reached), moment in zip(situations, MOMENTS, strict=True):
+        print(f"importance, {moment}: {int(reached.sum())} of {len(reached)} teams come there")
+        if not reached.any():
+            raise ValueError(f"policy: no team of {next(iter(crossings))!r} gets there; name one that crosses first")
     means: dict[str, Tensor] = {}
     for name, crossing in crossings.items():
         means[name] = torch.stack([ask(crossing, state)[reached].mean(0) for state, reached in situations])
-    for (_, reached), moment in zip(situations, MOMENTS, strict=True):
-        print(f"importance, {moment}: {int(reached.sum())} of {len(reached)} teams come there")
+        # beside it, the paper's own measure
+        norms = torch.stack([message_norms(crossing, state)[reached].mean(0) for state, reached in situations])
+        print(f"{name}: mean importance {others(means[name]):.3f} 1/s, mean norm of a message {others(norms):.2f}")
     position = torch.stack([state["position"][reached].mean(0) for state, reached in situations])
     world = first.scenario
     for path in files(arguments, "importance"):
@@ -162,7 +167,9 @@ def draw_importance(arguments: Arguments, crossings: dict[str, Crossing]) -> Non
 
 def draw_denoising(arguments: Arguments, crossings: dict[str, Crossing]) -> None:
     """Every step of the chain of every policy, in the first one's situation, Fig. 3 as figures and films."""
-    state, _ = situation(next(iter(crossings.values())), ENTRANCE)
+    state, reached = situation(next(iter(crossings.values())), ENTRANCE)
+    if not reached[arguments.start]:
+        raise ValueError(f"start: got {arguments.start}, from which {next(iter(crossings))!r} does not come far enough")
     place = state["position"][arguments.start]
     for name, crossing in crossings.items():
         encoder, actor = crossing.policy[0], crossing.policy[-1]
@@ -179,7 +186,8 @@ def draw_denoising(arguments: Arguments, crossings: dict[str, Crossing]) -> None
             plot_denoising(path, steps, velocity, world.max_speed)
         shown = torch.linspace(0, len(steps) - 1, min(FRAMES, len(steps))).round().int().tolist()
         film = arguments.out / f"{label}.gif"
-        animate_denoising(film, [steps[k] for k in shown], velocity[shown], place, world.obstacle_map, world.radius)
+        moving = velocity[shown, :FILM_CHAINS]
+        animate_denoising(film, [steps[k] for k in shown], moving, place, world.obstacle_map, world.radius)
 
 
 def situation(crossing: Crossing, share: float) -> tuple[dict[str, Tensor], Tensor]:
@@ -202,6 +210,18 @@ def situation(crossing: Crossing, share: float) -> tuple[dict[str, Tensor], Tens
 def ask(crossing: Crossing, state: dict[str, Tensor]) -> Tensor:
     """Importance of every message ``[E, n, n]`` (1/s)."""
     return message_importance(lambda p: crossing.act(crossing.observe(state, p)), state["position"])
+
+
+def message_norms(crossing: Crossing, state: dict[str, Tensor]) -> Tensor:
+    """Norm of every message ``[E, n, n]``."""
+    with torch.no_grad():
+        return crossing.policy[0].module.message_norms(crossing.observe(state, state["position"]))
+
+
+def others(value: Tensor) -> float:
+    """Mean over all pairs of different robots, ``[*B, n, n]``."""
+    n = value.shape[-1]
+    return value[..., ~torch.eye(n, dtype=torch.bool)].mean().item()
 
 
 def files(arguments: Arguments, name: str) -> Sequence[Path]:

@@ -8,6 +8,7 @@ import torch
 from torch import Tensor
 
 
+@torch.enable_grad()
 def message_importance(act: Callable[[Tensor], Tensor], position: Tensor) -> Tensor:
     """Importance of every message, ``I_ij = |d a_i / d p_j|_F``: m/s of robot i's command for a metre of robot j.
 
@@ -41,8 +42,7 @@ def message_importance(act: Callable[[Tensor], Tensor], position: Tensor) -> Ten
     if position.ndim < 2 or position.shape[-1] != 2:
         raise ValueError(f"position: got shape {list(position.shape)}, expected [*B, n, 2]")
     place = position.detach().clone().requires_grad_()
-    with torch.enable_grad():
-        command = act(place)
+    command = act(place)
     if command.ndim != place.ndim or command.shape[:-1] != place.shape[:-1]:
         expected = f"[{', '.join(map(str, place.shape[:-1]))}, A]"
         raise ValueError(f"act: it returned shape {list(command.shape)}, expected {expected}")

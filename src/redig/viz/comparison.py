@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from redig.envs.maps import ObstacleMap
-from redig.viz.panels import TWO_COLUMNS, panel_grid
+from redig.viz.panels import LEGEND, TWO_COLUMNS, panel_grid
 from redig.viz.scene import INK, SHAPE, check_trajectory, draw_map, formation_outline, save_figure, view
 from redig.viz.team import draw_formation, draw_paths, number_robots
 
@@ -73,7 +73,13 @@ def plot_comparison(
         if touching[name].shape != track.shape[:-1]:
             seen = f"{list(touching[name].shape)} of {name!r}"
             raise ValueError(f"collision: got shape {seen}, expected {list(track.shape[:-1])}")
-    outline = formation_outline(formation, next(iter(tracks.values())).shape[1])
+    n = next(iter(tracks.values())).shape[1]
+    for name, track in tracks.items():
+        if track.shape[1] != n:
+            raise ValueError(
+                f"position: got {track.shape[1]} robots of {name!r}, expected the same number of robots, {n}"
+            )
+    outline = formation_outline(formation, n)
     region = view(np.concatenate([track.reshape(-1, 1, 2) for track in tracks.values()]), goals)
     ratio = (region[3] - region[2]) / (region[1] - region[0])
     instants = _instants([len(track) for track in tracks.values()], dt)
@@ -97,7 +103,7 @@ def plot_comparison(
         handles.append(Line2D([], [], color=INK, marker="+", linestyle="", label="goal"))
     cross = {"marker": "X", "color": INK, "linestyle": "", "markeredgecolor": "white", "markersize": 7}
     handles.append(Line2D([], [], **cross, label="collision begins"))
-    figure.legend(handles=handles, loc="outside upper center", ncols=len(handles), fontsize=8, frameon=False)
+    figure.legend(handles=handles, ncols=len(handles), handlelength=1.5, **LEGEND)
     save_figure(figure, path)
 
 

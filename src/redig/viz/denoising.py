@@ -12,7 +12,7 @@ from matplotlib.patches import Rectangle
 from numpy.typing import NDArray
 from torch import Tensor
 
-from redig.viz.panels import TWO_COLUMNS
+from redig.viz.panels import LEGEND, TWO_COLUMNS
 from redig.viz.scene import INK, SHAPE, robot_style, save_figure
 
 ROWS = 5
@@ -23,18 +23,17 @@ def plot_denoising(
     steps: Sequence[int],
     velocity: Tensor,
     max_speed: float = 1.0,
-    width: float = TWO_COLUMNS,
 ) -> None:
     """Draw the velocities of all robots at five steps of the chain: a row a step, a column a robot.
 
-    Dots are many chains for the same situation, arrows the first of them; the square holds the allowed commands.
+    Dots are many chains for the same situation, arrows the first of them; the square holds the allowed commands. The
+    figure is two columns of a page wide.
 
     Args:
         path: of the figure, PNG, PDF or SVG by its suffix; an existing file is replaced at once.
         steps: S steps of the chain, the noisiest first, see :func:`redig.evaluation.denoising.denoising_path`.
         velocity: ``[S, L, n, 2]`` (m/s) of L chains.
         max_speed: limit of each component of a command (m/s).
-        width: of the figure (inches).
 
     Raises:
         ValueError: if the shapes do not fit each other, or the suffix is not one of those allowed.
@@ -51,7 +50,7 @@ def plot_denoising(
     shown = np.unique(np.linspace(0, len(steps) - 1, ROWS).round().astype(int))
     n = chain.shape[2]
     limit = max(float(np.quantile(np.abs(chain), 0.995)), 1.2 * max_speed)
-    figure = Figure(figsize=(width, (width - 0.6) / n * len(shown) + 0.8), layout="constrained")
+    figure = Figure(figsize=(TWO_COLUMNS, (TWO_COLUMNS - 0.6) / n * len(shown) + 0.8), layout="constrained")
     grid = figure.subplots(len(shown), n, sharex=True, sharey=True, squeeze=False)
     for row, k in zip(grid, shown, strict=True):
         for i, axes in enumerate(row):
@@ -75,7 +74,7 @@ def plot_denoising(
         Line2D([], [], color=INK, marker=r"$\rightarrow$", markersize=9, linestyle="", label="one of them"),
         Line2D([], [], color=SHAPE, linestyle=(0, (3, 2)), linewidth=0.7, label="allowed commands"),
     ]
-    figure.legend(handles=handles, loc="outside upper center", ncols=3, fontsize=8, frameon=False)
+    figure.legend(handles=handles, ncols=3, **LEGEND)
     save_figure(figure, path)
 
 

@@ -60,6 +60,8 @@ def animate_denoising(
         3
     """
     path = check_suffix(path, VIDEO_SUFFIXES)
+    if fps < 1:
+        raise ValueError(f"fps: got {fps}, must be at least 1")
     chain = check_chain(steps, velocity)
     place = check_trajectory(position.unsqueeze(0), None)[0]
     if place.shape[1] != chain.shape[2]:

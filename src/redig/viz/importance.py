@@ -31,12 +31,11 @@ def plot_importance(
     moments: Sequence[str],
     obstacle_map: ObstacleMap,
     radius: float = 0.1,
-    width: float = TWO_COLUMNS,
 ) -> None:
     """Draw who moves whom: for each policy a row of graphs and a row of tables, a column a moment, on one scale.
 
     An arrow goes from the robot that speaks to the one that hears; the wider and darker, the more its command depends
-    on what was said. The tables hold the same numbers.
+    on what was said. The tables hold the same numbers. The figure is two columns of a page wide.
 
     Args:
         path: of the figure, PNG, PDF or SVG by its suffix; an existing file is replaced at once.
@@ -46,7 +45,6 @@ def plot_importance(
         moments: what to call the moments.
         obstacle_map: the map.
         radius: of a robot (m).
-        width: of the figure (inches).
 
     Raises:
         ValueError: if there is no policy, shapes do not fit each other, or the suffix is not one of those allowed.
@@ -74,9 +72,9 @@ def plot_importance(
     values = {name: _others_only(value.numpy(force=True)) for name, value in importance.items()}
     scale = Normalize(0, max(float(np.nanmax(value)) for value in values.values()) or 1.0)
     half = (place.max(1) - place.min(1)).max() / 2 + 4 * radius
-    panel = (width - 1.3) / len(moments)
+    panel = (TWO_COLUMNS - 1.3) / len(moments)
     height = len(values) * (panel * 1.62 + 0.25) + 0.6
-    figure = Figure(figsize=(width, height), layout="constrained")
+    figure = Figure(figsize=(TWO_COLUMNS, height), layout="constrained")
     ratios = [1.0, 0.62] * len(values)
     grid = figure.subplots(2 * len(values), len(moments), height_ratios=ratios, squeeze=False)
     for row, (name, value) in enumerate(values.items()):

@@ -10,11 +10,12 @@ import numpy as np
 from matplotlib.ticker import MaxNLocator
 from torch import Tensor
 
-from redig.viz.panels import TWO_COLUMNS, panel_grid
+from redig.viz.panels import LEGEND, TWO_COLUMNS, panel_grid
 from redig.viz.scene import INK, robot_style, save_figure
 
 LEAST_WIDTH = 2.0  # of a panel (inches)
 MARKERS = "os^Dv<>"
+BAND = "#C8C8C8"  # the mean, under the lines of the robots
 
 
 def plot_jerk(path: str | os.PathLike, jerk: Mapping[str, Tensor], dt: float = 0.1, width: float = TWO_COLUMNS) -> None:
@@ -45,7 +46,7 @@ def plot_jerk(path: str | os.PathLike, jerk: Mapping[str, Tensor], dt: float = 0
     for name, profile in values.items():
         if profile.ndim != 2 or np.isnan(profile).all():
             raise ValueError(f"jerk: got shape {list(profile.shape)} of {name!r}, expected [T, n] with values")
-    figure, panels = panel_grid(len(values), width, LEAST_WIDTH, ratio=0.75)
+    figure, panels = panel_grid(len(values), width, LEAST_WIDTH, ratio=0.6)
     for axes, (name, profile) in zip(panels, values.items(), strict=True):
         time = dt * (np.arange(len(profile)) + 1.5)
         for i, robot in enumerate(profile.T):
@@ -55,7 +56,7 @@ def plot_jerk(path: str | os.PathLike, jerk: Mapping[str, Tensor], dt: float = 0
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", RuntimeWarning)  # at times, all robots have arrived
             mean = np.nanmean(profile, 1)
-        axes.plot(time, mean, color=INK, linewidth=1.8, zorder=1.9, label="mean of the robots")
+        axes.plot(time, mean, color=BAND, linewidth=3.5, zorder=1.9, label="their mean")
         overall = float(np.nanmean(profile))
         axes.axhline(overall, color=INK, linestyle=(0, (4, 3)), linewidth=0.9, label="mean over time")
         axes.set_title(f"{name}: mean {overall:.2f} m/s³", size=9, loc="left")
@@ -69,5 +70,5 @@ def plot_jerk(path: str | os.PathLike, jerk: Mapping[str, Tensor], dt: float = 0
     panels[0].yaxis.set_major_locator(MaxNLocator(6, integer=True))
     handles, labels = panels[0].get_legend_handles_labels()
     columns = 4 if width < 5 else len(handles)
-    figure.legend(handles, labels, loc="outside upper center", ncols=columns, fontsize=7, frameon=False)
+    figure.legend(handles, labels, ncols=columns, handlelength=1.8, **LEGEND)
     save_figure(figure, path)

@@ -6,6 +6,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 ONE_COLUMN, TWO_COLUMNS = 3.4, 7.0  # widths of a figure in a paper of two columns (inches)
+LEGEND = {"loc": "outside upper center", "frameon": False, "fontsize": 7, "handletextpad": 0.5, "columnspacing": 1.2}
 
 
 def panel_grid(count: int, width: float, least_width: float, ratio: float) -> tuple[Figure, list[Axes]]:

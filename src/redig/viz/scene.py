@@ -141,5 +141,4 @@ def save_figure(figure: Figure, path: str | os.PathLike) -> None:
         ['empty.pdf']
     """
     with mpl.rc_context({"pdf.fonttype": 42}), replacing(check_suffix(path, IMAGE_SUFFIXES)) as unfinished:
-        smaller = {"pil_kwargs": {"optimize": True}} if unfinished.suffix.lower() == ".png" else {}
-        figure.savefig(unfinished, dpi=200, **smaller)
+        figure.savefig(unfinished, dpi=200)
