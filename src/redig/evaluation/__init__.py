@@ -8,6 +8,7 @@ from redig.evaluation.critic_bound import (
     density_ratio,
     statistical_error,
 )
+from redig.evaluation.denoising import denoising_path
 from redig.evaluation.diffusion_bound import (
     discretization_error,
     discretization_term,
@@ -17,6 +18,7 @@ from redig.evaluation.diffusion_bound import (
     prior_mismatch_floor,
 )
 from redig.evaluation.evaluate import evaluate, evaluate_teams, rollout_trajectories
+from redig.evaluation.message_importance import message_importance
 from redig.evaluation.metrics import (
     contextual_formation_integrity,
     gap_term,
@@ -33,6 +35,7 @@ __all__ = [
     "contextual_formation_integrity",
     "coverage",
     "coverage_constant",
+    "denoising_path",
     "density_ratio",
     "discretization_error",
     "discretization_term",
@@ -43,6 +46,7 @@ __all__ = [
     "jerk",
     "matching_divergence",
     "matching_error",
+    "message_importance",
     "prior_mismatch",
     "prior_mismatch_floor",
     "rollout_trajectories",

@@ -7,6 +7,7 @@ import torch
 from torch import Tensor
 
 from redig.envs.maps import ObstacleMap
+from redig.envs.occupancy import OccupancyMap
 from redig.planning.astar import astar
 from redig.planning.curves import resample, smooth
 from redig.planning.grid import OccupancyGrid, occupancy_grid
@@ -14,7 +15,7 @@ from redig.planning.grid import OccupancyGrid, occupancy_grid
 RAY_STEP = 0.05  # m
 
 
-def team_grid(obstacle_map: ObstacleMap, radius: float, reach: float) -> OccupancyGrid:
+def team_grid(obstacle_map: ObstacleMap | OccupancyMap, radius: float, reach: float) -> OccupancyGrid:
     """A grid that is free near the middle of the map's gap, and where there is room, ``reach`` (m) from obstacles.
 
     Args:
@@ -39,7 +40,7 @@ def team_grid(obstacle_map: ObstacleMap, radius: float, reach: float) -> Occupan
 
 
 def centre_path(
-    obstacle_map: ObstacleMap,
+    obstacle_map: ObstacleMap | OccupancyMap,
     grid: OccupancyGrid,
     start: Tensor,
     goal: Tensor,
@@ -110,7 +111,7 @@ def normals(path: Tensor) -> Tensor:
     return torch.stack([-along[:, 1], along[:, 0]], -1)
 
 
-def free_width(obstacle_map: ObstacleMap, path: Tensor, reach: float) -> tuple[Tensor, Tensor]:
+def free_width(obstacle_map: ObstacleMap | OccupancyMap, path: Tensor, reach: float) -> tuple[Tensor, Tensor]:
     """How far it is from each point of a path to the first obstacle on its left and on its right, at most ``reach``.
 
     Args:

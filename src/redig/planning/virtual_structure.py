@@ -11,6 +11,7 @@ from torch import Tensor
 
 from redig.envs.formations import formation_integrity
 from redig.envs.maps import ObstacleMap
+from redig.envs.occupancy import OccupancyMap
 from redig.planning.centre_path import centre_path, free_width, normals, team_grid
 from redig.planning.curves import sample, smooth
 from redig.planning.grid import OccupancyGrid
@@ -59,7 +60,7 @@ class StructurePlanner:
         (True, True)
     """
 
-    obstacle_map: ObstacleMap
+    obstacle_map: ObstacleMap | OccupancyMap
     formation: str
     offsets: Tensor
     radius: float

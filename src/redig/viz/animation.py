@@ -56,12 +56,24 @@ def animate(
         raise ValueError(f"fps: got {fps}, must be at least 1")
     track, goals = check_trajectory(position, goal)
     canvas = TeamCanvas(view(track, goals), track.shape[1], formation, obstacle_map, goals, radius)
-    with replacing(path) as unfinished, _writer(unfinished, fps) as writer:
+    with replacing(path) as unfinished, film_writer(unfinished, fps) as writer:
         for k in range(len(track)):
             writer.append_data(canvas.draw(track[: k + 1], k * dt))
 
 
-def _writer(path: Path, fps: int) -> Any:
+def film_writer(path: Path, fps: int) -> Any:
+    """A writer of frames ``[H, W, 3]`` (uint8) into a GIF or MP4; the sides of an MP4 must be multiples of 16.
+
+    Examples:
+        >>> import tempfile
+        >>> import numpy as np
+        >>> with tempfile.TemporaryDirectory() as folder:
+        ...     path = Path(folder, "film.gif")
+        ...     with film_writer(path, fps=10) as writer:
+        ...         writer.append_data(np.zeros((16, 16, 3), dtype=np.uint8))
+        ...     len(imageio.mimread(path))
+        1
+    """
     if path.suffix.lower() == ".gif":
         return imageio.get_writer(path, mode="I", duration=1000 / fps, loop=0, subrectangles=True)
     return imageio.get_writer(path, mode="I", fps=fps, codec="libx264", macro_block_size=BLOCK)

@@ -10,8 +10,7 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.ticker import MaxNLocator
 
-from redig.files import replacing
-from redig.viz.scene import IMAGE_SUFFIXES, INK, PALETTE, check_suffix
+from redig.viz.scene import IMAGE_SUFFIXES, INK, PALETTE, check_suffix, save_figure
 
 DASHES = (0, (4, 3))
 Row = Mapping[str, float | None]
@@ -60,8 +59,7 @@ def plot_learning_curves(path: str | os.PathLike, *runs: Sequence[Row]) -> None:
             axes.set_xlabel("updates", size=9)
     cloned = Line2D([], [], color=INK, linestyle=DASHES, linewidth=0.9, label="before online training")
     figure.legend(handles=[cloned], loc="outside upper right", fontsize=8, frameon=False)
-    with replacing(path) as unfinished:
-        figure.savefig(unfinished, dpi=200)
+    save_figure(figure, path)
 
 
 def _panel(axes: Axes, runs: Sequence[Sequence[Row]], series: Mapping[str, str]) -> None:

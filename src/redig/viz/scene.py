@@ -5,10 +5,12 @@ from __future__ import annotations
 import os
 from pathlib import Path
 
+import matplotlib as mpl
 import numpy as np
 import torch
 from matplotlib.axes import Axes
 from matplotlib.colors import ListedColormap
+from matplotlib.figure import Figure
 from matplotlib.patches import Polygon
 from matplotlib.transforms import Affine2D
 from numpy.typing import NDArray
@@ -17,6 +19,7 @@ from torch import Tensor
 from redig.envs.formations import formation_offsets
 from redig.envs.maps import ObstacleMap
 from redig.envs.occupancy import OccupancyMap
+from redig.files import replacing
 
 # Okabe and Ito's palette for colour-blind readers, without its black (walls, text) and its yellow (too pale in print)
 PALETTE = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9")
@@ -146,3 +149,22 @@ def check_suffix(path: str | os.PathLike, allowed: tuple[str, ...]) -> Path:
     if path.suffix.lower() not in allowed:
         raise ValueError(f"path: got {path.name!r}, its suffix must be one of {', '.join(allowed)}")
     return path
+
+
+def save_figure(figure: Figure, path: str | os.PathLike) -> None:
+    """Write a figure in its true size, as PNG, PDF or SVG by the suffix; an existing file is replaced at once.
+
+    PDF files hold their fonts as TrueType, as publishers ask.
+
+    Raises:
+        ValueError: if the suffix is not one of those allowed.
+
+    Examples:
+        >>> import tempfile
+        >>> with tempfile.TemporaryDirectory() as folder:
+        ...     save_figure(Figure(figsize=(3.4, 2.0)), f"{folder}/empty.pdf")
+        ...     os.listdir(folder)
+        ['empty.pdf']
+    """
+    with mpl.rc_context({"pdf.fonttype": 42}), replacing(check_suffix(path, IMAGE_SUFFIXES)) as unfinished:
+        figure.savefig(unfinished, dpi=200)

@@ -7,13 +7,11 @@ import os
 import numpy as np
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
-from matplotlib.patches import Circle
 from numpy.typing import NDArray
 from torch import Tensor
 
 from redig.envs.maps import ObstacleMap
 from redig.envs.occupancy import OccupancyMap
-from redig.files import replacing
 from redig.viz.scene import (
     IMAGE_SUFFIXES,
     INK,
@@ -23,9 +21,10 @@ from redig.viz.scene import (
     check_trajectory,
     draw_map,
     formation_outline,
-    robot_style,
+    save_figure,
     view,
 )
+from redig.viz.team import draw_formation, draw_paths, number_robots
 
 INSTANTS = 6
 
@@ -65,36 +64,17 @@ def plot_trajectories(
     """
     path = check_suffix(path, IMAGE_SUFFIXES)
     track, goals = check_trajectory(position, goal)
-    n = track.shape[1]
-    outline = formation_outline(formation, n)
+    outline = formation_outline(formation, track.shape[1])
     region = view(track, goals)
     width = 7.0
     height = (width - 0.7) * (region[3] - region[2]) / (region[1] - region[0]) + 0.75
     figure = Figure(figsize=(width, height), layout="constrained")
     axes = figure.add_subplot()
     draw_map(axes, obstacle_map, region)
-    for i in range(n):
-        colour, line = robot_style(i)
-        axes.plot(*track[:, i].T, color=colour, linestyle=line, linewidth=1.4, zorder=3)
+    draw_paths(axes, track)
     for k in _instants(track):
-        axes.plot(*track[k][outline].T, color=SHAPE, linewidth=0.9, zorder=2)
-        for i in range(n):
-            colour, _ = robot_style(i)
-            face = colour if k == 0 else "white"
-            disc = Circle(track[k, i], radius, facecolor=face, edgecolor=colour, linewidth=1.1, zorder=4)
-            axes.add_patch(disc)
-    for i in range(n):
-        axes.text(
-            track[0, i, 0],
-            track[0, i, 1],
-            str(i),
-            color="white",
-            size=7,
-            weight="bold",
-            ha="center",
-            va="center",
-            zorder=6,
-        )
+        draw_formation(axes, track[k], outline, radius, filled=k == 0)
+    number_robots(axes, track[0])
     handles = [
         Line2D([], [], color=PALETTE[0], linewidth=1.4, label="path of a robot"),
         Line2D([], [], color=SHAPE, linewidth=0.9, label=f"formation ({formation})"),
@@ -103,8 +83,7 @@ def plot_trajectories(
         axes.scatter(goals[:, 0], goals[:, 1], marker="x", s=24, color=INK, linewidths=1.2, zorder=5)
         handles.append(Line2D([], [], color=INK, marker="x", linestyle="", label="goal"))
     figure.legend(handles=handles, loc="outside upper center", ncols=len(handles), fontsize=8, frameon=False)
-    with replacing(path) as unfinished:
-        figure.savefig(unfinished, dpi=200)
+    save_figure(figure, path)
 
 
 def _instants(track: NDArray) -> NDArray:
