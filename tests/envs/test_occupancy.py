@@ -67,7 +67,7 @@ def test_a_rasterised_map_has_its_distances_and_directions(yaw):
 @given(matrices, st.floats(-math.pi, math.pi), st.integers(0, 1000))
 @settings(max_examples=25, deadline=None)
 def test_the_field_against_single_cells(cells, yaw, seed):
-    """Within a quarter of a cell's diagonal of the distance to every occupied square, one by one, and inside negative."""
+    """Within a quarter of a cell's diagonal of the distance to every occupied square, and negative inside."""
     resolution, origin = 0.5, (0.3, -1.0, yaw)
     grid = OccupancyMap(torch.from_numpy(cells), resolution, origin, gap=1.0)
     height, width = cells.shape
