@@ -95,7 +95,8 @@ def measure(file: Path, starts: int, seed: int, folder: Path) -> None:
         writer = csv.DictWriter(sheet, fieldnames=list(rows[0]))
         writer.writeheader()
         writer.writerows(rows)
-    cells = [list(rows[0]), ["---"] * len(rows[0]), *(list(map(str, row.values())) for row in rows)]
+    body = [["-" if value != value else str(value) for value in row.values()] for row in rows]
+    cells = [list(rows[0]), ["---"] * len(rows[0]), *body]
     with replacing(folder / "table.md") as path:
         path.write_text("".join(f"| {' | '.join(line)} |\n" for line in cells))
 

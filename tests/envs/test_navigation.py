@@ -1,10 +1,11 @@
 import math
+from itertools import pairwise
 
 import pytest
 import torch
 from torchrl.envs import check_env_specs
 
-from redig.envs import formation_offsets, make_env, pairwise_distances
+from redig.envs import curve, formation_offsets, make_env, pairwise_distances
 from redig.envs.maps import ObstacleMap
 
 PARTS = ("navigation_reward", "formation_reward", "arrival_reward", "collision_reward")
@@ -379,3 +380,41 @@ def test_a_goal_inside_a_wall_is_refused():
 def test_unknown_arguments_are_refused():
     with pytest.raises(TypeError, match=r"unknown argument.*FormationNavigation: corridor, speed"):
         make_env(2, speed=1.0, corridor=2.0)
+
+
+def test_on_a_map_with_a_route_the_team_starts_and_ends_on_it():
+    bend = curve(radius=3.0, turn=1.2)
+    env = make_env(100, obstacle_map=bend, position_jitter=0.2, heading_jitter=0.1, start_distance=1.0)
+    start = env.reset()["agents", "observation"][..., :2]
+    goal, headings = env.base_env.scenario.goal, []
+    for place, point in ((start, bend.route[0]), (goal, bend.route[-1])):
+        centre = place.mean(1)
+        assert 0.15 < (centre - point).norm(dim=-1).max() <= 0.2 * math.sqrt(2) + 1e-4
+        apex = place[:, 0] - centre
+        headings.append(torch.atan2(apex[:, 1], apex[:, 0]))
+    for heading, expected in zip(headings, (-0.6, 0.6), strict=True):
+        assert 0.08 < (heading - expected).abs().max() <= 0.1 + 1e-4
+
+
+@pytest.mark.parametrize("turn", [1.2, -1.2])
+def test_a_formation_that_turns_with_the_route_is_whole_all_along_it(turn):
+    bend = curve(radius=3.0, turn=turn, piece=0.1)
+    still = {"position_jitter": 0.0, "heading_jitter": 0.0, "max_acceleration": 0.001}
+    env = make_env(1, obstacle_map=bend, formation_reward="scaled", formation="line", n_robots=3, **still)
+    state = env.reset()
+    across = 0.3 * formation_offsets("line", 3)[:, 1:]  # squeezed to the least scale that the reward allows
+    for a, b in pairwise(bend.route):
+        along = (b - a) / (b - a).norm()
+        left = torch.stack([-along[1], along[0]])
+        for robot, offset in enumerate(across):
+            put(env, robot, ((a + b) / 2 + offset * left).tolist())
+        info = info_of(step(env, state, torch.zeros(1, 3, 2)))
+        torch.testing.assert_close(info["formation_reward"], torch.full((1, 3), 1 - 0.5 * 0.7), atol=1e-2, rtol=0)
+
+
+def test_a_goal_in_a_wall_at_the_end_of_a_route_is_refused():
+    blocked = ObstacleMap(
+        torch.tensor([[3.0, 0.0, 1.0, 1.0, 0.0, 0.0]]), 1.0, (-5, -5, 5, 5), torch.tensor([[-3.0, 0.0], [3.0, 0.0]])
+    )
+    with pytest.raises(ValueError, match=r"route: with it the goal of robot \d lies inside a wall"):
+        make_env(2, obstacle_map=blocked)

@@ -65,9 +65,9 @@ def test_a_rasterised_map_has_its_distances_and_directions(yaw):
 
 
 @given(matrices, st.floats(-math.pi, math.pi), st.integers(0, 1000))
-@settings(max_examples=25, deadline=None)
+@settings(max_examples=20, deadline=None)
 def test_the_field_against_single_cells(cells, yaw, seed):
-    """Within a quarter of a cell's diagonal of the distance to every occupied square, and negative inside."""
+    """Against the distance to every occupied square, one by one: the bounds of the docstring."""
     resolution, origin = 0.5, (0.3, -1.0, yaw)
     grid = OccupancyMap(torch.from_numpy(cells), resolution, origin, gap=1.0)
     height, width = cells.shape
@@ -79,8 +79,9 @@ def test_the_field_against_single_cells(cells, yaw, seed):
     squares = torch.tensor(np.stack([columns - 0.5, rows - 0.5], -1), dtype=torch.float32)  # their centres
     excess = (local[:, None] - squares).abs() - 0.5
     expected = excess.clamp_min(0).norm(dim=-1).amin(-1) * resolution
-    found = grid.signed_distance(world)
-    assert ((found - expected)[expected > 0].abs() <= 0.36 * resolution).all()
+    error = (grid.signed_distance(world) - expected) / resolution
+    assert (error <= 0.31).all()
+    assert (error[expected > 0] >= -0.6).all()
 
 
 @pytest.mark.parametrize("yaw", [0.0, 1.0])

@@ -1,10 +1,19 @@
+from dataclasses import replace
+
+import imageio.v2 as imageio
+import numpy as np
 import pytest
 import torch
+from tensordict.nn import TensorDictModule
 from torchrl.envs import StepCounter, TransformedEnv, VmasEnv
 from vmas.simulator.environment.environment import Environment
 
-from redig.envs import FormationNavigation
+from redig.envs import MAP_KINDS, FormationNavigation, MapBatch, OccupancyMap, corridor, doorway, load_occupancy_map
+from redig.evaluation import evaluate
 from redig.planning import demonstrations, occupancy_grid
+from redig.viz import plot_trajectories
+
+KEYS = ([("agents", "observation")], [("agents", "action")])
 
 
 def make_env(num_envs: int = 3, steps: int | None = None, **kwargs):
@@ -125,6 +134,9 @@ def test_second_call_reads_the_file(tmp_path, monkeypatch):
         ({"formation": "wedge"}, {}),
         ({"collision_penalty": 2.0}, {}),
         ({"corridor_width": 1.0}, {}),
+        ({"obstacle_map": doorway(gap=1.1)}, {}),
+        ({"obstacle_map": replace(corridor(), route=torch.tensor([[-2.7, 0.0], [2.7, 0.0]]))}, {}),
+        ({"obstacle_map": MapBatch((corridor(), corridor()))}, {}),
     ],
 )
 def test_any_other_setting_makes_another_file(tmp_path, env, settings):
@@ -199,3 +211,53 @@ def test_narrow_corridor_that_one_robot_fits_through():
     data = demonstrations(env, 6, max_steps=200, noise=0.0)
     alone = data["next", "agents", "info", "arrived"].squeeze(-1).amax(1)
     assert alone.any(-1).all()
+
+
+def arrived(data):
+    return (data["next", "agents", "info", "arrived"].squeeze(-1) * data["mask"].unsqueeze(-1)).amax(1)
+
+
+@pytest.mark.parametrize("kind", MAP_KINDS)
+def test_robots_cross_every_kind_of_map(kind):
+    env = make_env(2, steps=220, obstacle_map=f"{kind}:train")
+    assert arrived(demonstrations(env, 6, speed=(0.9, 1.0), max_steps=220)).all()
+
+
+@pytest.fixture
+def walled_file(tmp_path):
+    """A wall with a door of 1 m in a room of 9 m x 6 m, turned by a quarter, as a map server saves it."""
+    image = np.full((120, 180), 254, dtype=np.uint8)
+    image[:, 84:96] = 0
+    image[50:70, 84:96] = 254
+    image[0], image[-1] = 205, 205  # unknown
+    imageio.imwrite(tmp_path / "room.pgm", image)
+    (tmp_path / "room.yaml").write_text(
+        "image: room.pgm\nresolution: 0.05\norigin: [3.0, -4.5, 1.5707963]\nnegate: 0\noccupied_thresh: 0.65\n"
+        "free_thresh: 0.196\ngap: 1.0\nroute: [[0.0, -2.5], [0.0, 2.5]]\n"
+    )
+    return tmp_path / "room.yaml"
+
+
+def test_robots_cross_a_grid_from_a_file_and_a_drawing_shows_it(walled_file, tmp_path):
+    env = make_env(2, steps=150, obstacle_map=str(walled_file))
+    data = demonstrations(env, 6, speed=(0.9, 1.0), cache_dir=tmp_path / "cache", noise=0.0)
+    assert arrived(data).all()
+    position = data["agents", "observation"][..., :2]
+    assert (position[:, 0, :, 1] < -2).all() and (position[:, -1, :, 1] > 0).any()  # along y, which the file turned to
+    in_the_wall = (position[..., 1].abs() < 0.3)[data["mask"]]
+    assert in_the_wall.any()
+    assert position[..., 0][data["mask"]][in_the_wall].abs().max() < 0.42  # through the door
+    demonstrations(
+        make_env(2, steps=150, obstacle_map=load_occupancy_map(walled_file, gap=0.9)),
+        6,
+        speed=(0.9, 1.0),
+        cache_dir=tmp_path / "cache",
+        noise=0.0,
+    )
+    assert len(list((tmp_path / "cache").iterdir())) == 2
+    metrics = evaluate(TensorDictModule(lambda state: (2 * state[..., 4:6]).clamp(-1, 1), *KEYS), env, seed=0)
+    assert 0 <= metrics["cfi_0.5"] <= 1 and metrics["collision_rate"] > 0  # straight on, the outer robots hit the wall
+    grid = env.base_env.scenario.obstacle_map
+    assert isinstance(grid, OccupancyMap)
+    plot_trajectories(tmp_path / "crossing.png", position[0, :40], "line", grid)
+    assert (tmp_path / "crossing.png").stat().st_size > 10_000

@@ -4,6 +4,7 @@ from pathlib import Path
 
 import evaluate
 import pytest
+from config import Config
 from conftest import command
 from PIL import Image
 
@@ -75,3 +76,16 @@ def test_best_of_n_is_stated(smoke, tmp_path, capsys):
         evaluate.main(evaluate.Arguments(policy, **options))
     with pytest.raises(FileNotFoundError, match="critics: .* holds no run with a checkpoint"):
         evaluate.main(evaluate.Arguments(policy, critics=tmp_path, **options))
+
+
+def test_maps_are_named_in_options_and_stay_json(tmp_path):
+    assert "obstacle_map" not in Config().scenario()
+    forest = Config(map="forest")
+    assert json.loads(json.dumps(forest.scenario()))["obstacle_map"] == "forest:train"
+    assert forest.scenario("evaluation")["obstacle_map"] == "forest:evaluation"
+    assert Config(map="rooms/hall.yaml").scenario("evaluation")["obstacle_map"] == "rooms/hall.yaml"
+    metrics = evaluate.main(evaluate.Arguments(SHIPPED, starts=4, out=tmp_path, map="bollards", animation=False))
+    plain = evaluate.main(evaluate.Arguments(SHIPPED, starts=4, out=tmp_path, animation=False))
+    assert metrics != plain
+    with pytest.raises(ValueError, match="obstacle_map: got 'maze', must be KIND:SPLIT"):
+        evaluate.main(evaluate.Arguments(SHIPPED, starts=4, out=tmp_path, map="maze"))

@@ -3,9 +3,10 @@ import math
 import numpy as np
 import pytest
 import torch
+from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
-from redig.envs import FORMATIONS, ObstacleMap, formation_offsets
+from redig.envs import FORMATIONS, ObstacleMap, OccupancyMap, formation_offsets
 from redig.viz.scene import PALETTE, draw_map, formation_outline, robot_style, view
 
 
@@ -36,6 +37,28 @@ def test_drawn_outline_lies_on_the_zero_of_the_signed_distance(box):
     assert area == pytest.approx(4 * (a * b + (a + b) * r) + math.pi * r**2, rel=5e-3)
     assert axes.get_xlim() == (-3, 3)
     assert axes.get_ylim() == (-2, 2)
+
+
+def test_cells_are_drawn_where_the_signed_distance_is_negative():
+    cells = torch.zeros(6, 8, dtype=torch.bool)
+    cells[1, 6] = cells[4, 2] = True
+    grid = OccupancyMap(cells, 0.5, (-1.0, -2.0, 0.6), gap=1.0)
+    figure = Figure(figsize=(4, 4), dpi=100)
+    axes = figure.add_subplot()
+    draw_map(axes, grid, (-4, 4, -4, 4))
+    canvas = FigureCanvasAgg(figure)
+    canvas.draw()
+    shade = np.asarray(canvas.buffer_rgba())[::-1, :, 0]
+    across, up = torch.meshgrid(torch.arange(0.05, 4.0, 0.1), torch.arange(0.05, 3.0, 0.1), indexing="ij")
+    cos, sin = math.cos(0.6), math.sin(0.6)
+    points = torch.stack([-1 + cos * across - sin * up, -2 + sin * across + cos * up], -1).reshape(-1, 2)
+    distance = grid.signed_distance(points)
+    pixels = axes.transData.transform(points.numpy()).round().astype(int)
+    dark = torch.from_numpy(shade[pixels[:, 1], pixels[:, 0]] < 250)
+    clear = distance.abs() > 0.16
+    assert dark[clear & (distance < 0)].all()
+    assert not dark[clear & (distance > 0)].any()
+    assert (clear & (distance < 0)).any()
 
 
 def test_view_holds_motion_and_goals():

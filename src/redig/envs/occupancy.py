@@ -24,8 +24,8 @@ REQUIRED = ("image", "resolution", "origin", "negate", "occupied_thresh", "free_
 class OccupancyMap:
     """Square cells, occupied or free, as a signed distance field; what lies beyond them is occupied.
 
-    The distance from the centre of a cell is exact; between centres it is interpolated (bilinearly), so it is exact
-    along a straight wall, too, and off by less than a quarter of a cell at a corner.
+    The distance from the centre of a cell is exact; between centres it is interpolated (bilinearly). So it is exact
+    along a straight wall, at most 0.31 of a cell too great at a corner and 0.6 too small half way between walls.
 
     Args:
         occupied: bool ``[H, W]``; row 0 lies at the bottom (smallest y), column 0 at the left.
