@@ -1,0 +1,142 @@
+"""``redig-robot``: the program on a robot; see ``redig-robot --help`` and ``docs/robots.md``."""
+
+from __future__ import annotations
+
+import logging
+import signal
+from dataclasses import dataclass
+from pathlib import Path
+from threading import Event
+from typing import Literal
+
+import tyro
+
+from redig.deploy.drive import LIMO, WARTHOG, DifferentialDrive
+from redig.deploy.node import Drive, RobotNode, Wheels, holonomic
+from redig.deploy.pilot import Deadline, Pilot
+from redig.deploy.robot import RobotPolicy
+from redig.deploy.transport import Transport
+
+
+@dataclass
+class Arguments:
+    """Drive one robot of a team with a trained policy.
+
+    It reads the robot's own pose, twist, goal and nearest obstacle from topics in its namespace, tells them to its
+    neighbours on team_state, hears theirs, and publishes cmd_vel (geometry_msgs/Twist, along the robot's axes). It
+    publishes zero while its own state is stale, and never more than its limits. Run one such process for each robot.
+
+    Nothing on the network is authenticated: whoever reaches it can send states. The default reaches this machine only.
+    """
+
+    policy: Path
+    """Policy file: .onnx of one robot (recipes/export.py --ego; needs no torch) or .safetensors."""
+    namespace: str
+    """This robot's namespace, such as robot_0; its topics are /robot_0/pose, /robot_0/cmd_vel, ..."""
+    neighbours: tuple[str, ...] = ()
+    """Namespaces of the other robots: robot_1 robot_2 ...; no others are listened to. Its own may be among them."""
+    domain_id: int | None = None
+    """DDS domain, from 0 to 232 (ROS_DOMAIN_ID of ROS 2). ROS 2 only, and required there."""
+    interface: str = "lo"
+    """Network interface, such as wlan0; lo: this machine only. ROS 2 only."""
+    peers: tuple[str, ...] = ()
+    """Addresses of the other robots' computers, on networks without multicast. ROS 2 only."""
+    ros: Literal[2, 1] = 2
+    """2: DDS with ROS 2's messages, no ROS needed. 1: rospy, which must be installed; ROS_MASTER_URI says where."""
+    rate: float = 20.0
+    """Commands per second (Hz)."""
+    goal: tuple[float, float] | None = None
+    """Where to go (m), in the frame of the pose, until a message on the goal topic says otherwise."""
+    pose_topic: str = "pose"
+    """Own pose, geometry_msgs/PoseStamped. A topic that begins with / is not in the namespace."""
+    twist_topic: str = "twist"
+    """Own velocity, geometry_msgs/TwistStamped; along the robot's axes if its frame is not that of the pose."""
+    goal_topic: str = "goal"
+    """Goal, geometry_msgs/PoseStamped."""
+    obstacle_topic: str = "obstacle"
+    """Vector to the nearest obstacle (m), geometry_msgs/Vector3Stamped; frames as for the twist."""
+    command_topic: str = "cmd_vel"
+    """Where commands go."""
+    neighbour_timeout: float = 0.5
+    """Forget a neighbour that has not been heard for so long (s), by this robot's clock."""
+    own_timeout: float = 0.3
+    """Stand when the own state is older than this (s)."""
+    deadline: float = 0.1
+    """Stand when a step of the policy takes longer than this (s)."""
+    max_speed: float | None = None
+    """Speed limit (m/s); default: that of the policy's training."""
+    goal_radius: float | None = None
+    """Hold within this distance of the goal (m); default: that of the policy's training."""
+    drive: Literal["holonomic", "limo", "warthog"] = "holonomic"
+    """How the robot moves: in all directions, or with the differential drive and the limits of such a base."""
+
+
+def main() -> None:
+    """Entry point of ``redig-robot``."""
+    logging.basicConfig(format="%(asctime)s %(levelname)s %(message)s", level=logging.INFO)
+    arguments = tyro.cli(Arguments, prog="redig-robot")
+    stop = Event()
+    for number in (signal.SIGINT, signal.SIGTERM):
+        signal.signal(number, lambda *_: stop.set())
+    run(arguments, stop)
+
+
+def run(arguments: Arguments, stop: Event) -> None:
+    """Drive until ``stop`` is set.
+
+    Raises:
+        ValueError: for an argument that is not allowed.
+        FileNotFoundError: if there is no such policy.
+        ImportError: naming the extra that is not installed.
+    """
+    policy = RobotPolicy(arguments.policy)
+    trained = policy.environment
+    pilot = Pilot(
+        arguments.namespace.strip("/"),
+        [mate.strip("/") for mate in arguments.neighbours],
+        Deadline(policy, arguments.deadline),
+        max_speed=arguments.max_speed or trained.get("max_speed", 1.0),
+        timeout=arguments.neighbour_timeout,
+        own_timeout=arguments.own_timeout,
+        goal_radius=arguments.goal_radius or trained.get("goal_radius", 0.1),
+    )
+    transport = make_transport(arguments)
+    logging.info("%s drives with %s at %g Hz", pilot.robot, arguments.policy, arguments.rate)
+    try:
+        RobotNode(transport, pilot, make_drive(arguments)).run(arguments.rate, stop)
+    finally:
+        transport.close()
+
+
+def make_drive(arguments: Arguments) -> Drive:
+    """How this robot moves."""
+    if arguments.drive == "holonomic":
+        return holonomic
+    return Wheels(DifferentialDrive({"limo": LIMO, "warthog": WARTHOG}[arguments.drive]))
+
+
+def make_transport(arguments: Arguments) -> Transport:
+    """The network that the arguments ask for."""
+    given = {name: getattr(arguments, f"{name}_topic") for name in ("pose", "twist", "goal", "obstacle")}
+    topics = given | {"cmd_vel": arguments.command_topic}
+    if arguments.ros == 1:
+        from redig.deploy.ros1 import ROS1Transport
+
+        return ROS1Transport(arguments.namespace, arguments.neighbours, topics=topics, goal=arguments.goal)
+    if arguments.domain_id is None:
+        raise ValueError("domain_id: got None; ROS 2 needs --domain-id, the same for the whole team")
+    from redig.deploy.dds import DDSTransport
+
+    return DDSTransport(
+        arguments.namespace,
+        arguments.neighbours,
+        domain_id=arguments.domain_id,
+        interface=arguments.interface,
+        peers=arguments.peers,
+        topics=topics,
+        goal=arguments.goal,
+    )
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,130 @@
+"""A robot in a ROS 1 graph, through ``rospy`` where it is installed: Debian has it as ``python3-rospy``."""
+
+from __future__ import annotations
+
+import sys
+from collections import deque
+from collections.abc import Callable, Sequence
+from functools import partial
+from typing import Any
+
+from redig.deploy.messages import RobotState, Vector
+from redig.deploy.ros_state import Obstacle, StateParts, check_namespace, full_name, to_quaternion
+from redig.deploy.transport import BodyVelocity, Sensed
+
+DEBIAN = "/usr/lib/python3/dist-packages"  # behind the environment's own packages, never ahead of them
+sys.path += [DEBIAN] if DEBIAN not in sys.path else []
+try:
+    import rospy
+    from geometry_msgs.msg import Point, Pose, PoseStamped, Quaternion, Twist, TwistStamped, Vector3, Vector3Stamped
+    from std_msgs.msg import Header
+except ImportError as error:
+    raise ImportError(
+        "redig.deploy.ros1 needs rospy and geometry_msgs of ROS 1: apt install python3-rospy python3-geometry-msgs"
+    ) from error
+
+STATE_TOPICS = {"pose": PoseStamped, "twist": TwistStamped, "goal": PoseStamped, "obstacle": Vector3Stamped}
+DEPTH = 8  # messages of one topic that are kept between two looks
+
+
+class ROS1Transport:
+    """One robot in the graph of ``ROS_MASTER_URI``: topics and types as of :class:`redig.deploy.dds.DDSTransport`.
+
+    Args:
+        namespace: of this robot, such as ``robot_0``; also its name among the team.
+        neighbours: namespaces of the others.
+        topics: other names of topics; one that begins with a slash is not in the namespace.
+        goal, obstacle: see :class:`~redig.deploy.ros_state.StateParts`.
+
+    Raises:
+        ValueError: for a name that is not allowed.
+    """
+
+    def __init__(
+        self,
+        namespace: str,
+        neighbours: Sequence[str],
+        *,
+        topics: dict[str, str] | None = None,
+        goal: Vector | None = None,
+        obstacle: Obstacle | None = None,
+    ) -> None:
+        robot = check_namespace("namespace", namespace)
+        mates = [check_namespace("neighbours", mate) for mate in neighbours]
+        names = {name: full_name(robot, name, topics or {}) for name in (*STATE_TOPICS, "cmd_vel")}
+        rospy.init_node(f"redig_{robot.replace('/', '_')}", disable_signals=True)
+        self._own = StateReader(StateParts(robot, goal, obstacle), names)
+        self._mates = [
+            StateReader(StateParts(mate), {name: f"{mate}/team/{name}" for name in STATE_TOPICS})
+            for mate in mates
+            if mate != robot
+        ]
+        self._states = {
+            name: rospy.Publisher(f"/{robot}/team/{name}", kind, queue_size=1) for name, kind in STATE_TOPICS.items()
+        }
+        self._commands = rospy.Publisher(f"/{names['cmd_vel']}", Twist, queue_size=1)
+
+    def sense(self) -> Sensed | None:
+        """This robot's own state, once all of its parts have come anew."""
+        states = self._own.take()
+        return states[-1] if states else None
+
+    def send(self, sensed: Sensed) -> None:
+        """Publish a state for neighbours, in the frame of the pose."""
+        state, heading = sensed
+        header = Header(stamp=rospy.Time.from_sec(state.stamp), frame_id=self._own.parts.frame)
+        distance, (x, y) = state.obstacle_distance, state.obstacle_direction
+        place = Pose(Point(*state.position, 0.0), Quaternion(*to_quaternion(heading)))
+        self._states["twist"].publish(header, Twist(linear=Vector3(*state.velocity, 0.0)))
+        self._states["goal"].publish(header, Pose(position=Point(*state.goal, 0.0)))
+        self._states["obstacle"].publish(header, Vector3(distance * x, distance * y, 0.0))
+        self._states["pose"].publish(header, place)
+
+    def receive(self) -> list[RobotState]:
+        """States of neighbours, each once all of its parts have come anew."""
+        return [sensed.state for mate in self._mates for sensed in mate.take()]
+
+    def command(self, velocity: BodyVelocity) -> None:
+        """Publish a ``Twist``."""
+        message = Twist()
+        message.linear.x, message.linear.y, message.angular.z = velocity
+        self._commands.publish(message)
+
+    def close(self) -> None:
+        """Leave the graph."""
+        rospy.signal_shutdown("closed")
+
+
+class StateReader:
+    """The state of a robot, out of four topics; rospy calls back in threads of its own, where only a queue is touched.
+
+    Args:
+        parts: what puts them together.
+        topics: names of ``pose``, ``twist``, ``goal`` and ``obstacle``.
+    """
+
+    def __init__(self, parts: StateParts, topics: dict[str, str]) -> None:
+        self.parts = parts
+        self._hear: dict[str, Callable[[Any], None]] = {
+            "twist": parts.hear_twist,
+            "goal": parts.hear_goal,
+            "obstacle": parts.hear_obstacle,
+            "pose": lambda message: parts.hear_pose(message, message.header.stamp.to_sec()),
+        }
+        self._queue: deque[tuple[str, Any]] = deque(maxlen=4 * DEPTH)
+        for name, kind in STATE_TOPICS.items():
+            rospy.Subscriber(f"/{topics[name]}", kind, partial(self._put, name))
+
+    def take(self) -> list[Sensed]:
+        """States that have been completed since the last call."""
+        states = []
+        while self._queue:
+            name, message = self._queue.popleft()
+            self._hear[name](message)
+            state = self.parts.take()
+            if state is not None:
+                states.append(state)
+        return states
+
+    def _put(self, name: str, message: Any) -> None:
+        self._queue.append((name, message))
