@@ -225,16 +225,8 @@ class FormationNavigation(BaseScenario):
 
     def post_step(self) -> None:
         """Resolve contacts, then measure the step."""
+        wall, mate, free = self._settle()
         position, velocity = self._positions(), self._velocities()
-        obstacle_distance = self.obstacle_map.signed_distance(position)
-        wall = obstacle_distance < self.radius
-        mate_clearance = rewards.mate_clearance(position, self.radius)
-        mate = mate_clearance < 0
-        free = torch.minimum(mate_clearance, obstacle_distance - self.radius)
-        position, velocity = part_robots(position, velocity, self.radius)
-        position, velocity = leave_walls(position, velocity, self.radius, *self.obstacle_map.nearest(position))
-        for i, agent in enumerate(self.world.agents):
-            agent.state.pos, agent.state.vel = position[:, i], velocity[:, i]
         collision = wall | mate
         near_goal = (self.goal - position).norm(dim=-1) < self.goal_radius
         arriving = near_goal & ~self.arrived
@@ -255,6 +247,21 @@ class FormationNavigation(BaseScenario):
         }
         terminated = (collision & self.collision_terminates) | (self.arrived & self.arrival_terminates)
         self._quantities = self._measure(position, velocity, parts, wall, mate, terminated)
+
+    def _settle(self) -> tuple[Tensor, Tensor, Tensor]:
+        """Move robots out of contact; whether each touched a wall, or a mate, and its free space (m): ``[B, n]``."""
+        position, velocity = self._positions(), self._velocities()
+        obstacle_distance = self.obstacle_map.signed_distance(position)
+        mate_clearance = rewards.mate_clearance(position, self.radius)
+        free = torch.minimum(mate_clearance, obstacle_distance - self.radius)
+        position, velocity = part_robots(position, velocity, self.radius)
+        position, velocity = leave_walls(position, velocity, self.radius, *self.obstacle_map.nearest(position))
+        self._place(position, velocity)
+        return obstacle_distance < self.radius, mate_clearance < 0, free
+
+    def _place(self, position: Tensor, velocity: Tensor) -> None:
+        for i, agent in enumerate(self.world.agents):
+            agent.state.pos, agent.state.vel = position[:, i], velocity[:, i]
 
     def _formation_reward(self, position: Tensor, velocity: Tensor) -> Tensor:
         if self.formation_reward == "scaled":

@@ -1,0 +1,6 @@
+"""Physics: the same task with wheels, inertia, friction and contacts, in MuJoCo (``pip install 'redig[mujoco]'``)."""
+
+from redig.physics.model import Ground, RobotBody, team_model
+from redig.physics.world import PhysicsWorld
+
+__all__ = ["Ground", "PhysicsWorld", "RobotBody", "team_model"]
