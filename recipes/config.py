@@ -132,6 +132,14 @@ class Config(Task):
     its plain recipe does not survive online training; docs/paper.md says what and why.
     """
 
+    # what differs from robot to robot and from step to step in training and validation, not in demonstrations
+    action_delay: tuple[int, int] = (0, 0)
+    """Smallest and largest delay of commands (steps), drawn for each team and episode."""
+    observation_noise: float = 0.0
+    """Standard deviation of noise on what robots sense (m, m/s)."""
+    acceleration_range: tuple[float, float] = (1.0, 1.0)
+    """Smallest and largest factor on the acceleration limit, drawn for each team and episode."""
+
     # demonstrations and cloning
     num_trajectories: int = 5000
     """Trajectories of single robots, planned without coordination unless planner says otherwise."""
@@ -236,6 +244,15 @@ class Config(Task):
     """Noise of ddim, from 0 to 1."""
     best_of_n: int = 1
     """Collect with the best of N sampled actions by min Q; 1: off. Evaluations are of the policy itself."""
+
+    def randomisation(self) -> dict[str, Any]:
+        """Arguments of :func:`redig.envs.make_env` for the teams that train, beside those of the scenario."""
+        scaled = tuple(self.acceleration_range) != (1, 1)
+        return {
+            "action_delay": self.action_delay,
+            "observation_noise": self.observation_noise,
+            "acceleration_range": self.acceleration_range if scaled else None,
+        }
 
     def resolve(self) -> Config:
         """The configuration to run: that of a run to resume, or this one at toy size, checked.

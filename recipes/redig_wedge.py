@@ -46,8 +46,9 @@ def train(config: Config) -> dict[str, float]:
         torch.set_num_threads(config.threads)
     torch.manual_seed(config.seed)
     scenario = config.scenario()
-    env = make_env(config.num_envs, seed=config.seed, reward_scale=config.reward_scale, **scenario)
-    validation_env = make_env(config.evaluation_starts, **scenario)
+    trained = scenario | config.randomisation()
+    env = make_env(config.num_envs, seed=config.seed, reward_scale=config.reward_scale, **trained)
+    validation_env = make_env(config.evaluation_starts, **trained)
 
     # Line 1: initialise phi, psi, Q1 and Q2
     policy_config = policy_architecture(config, env.observation_spec[OBSERVATION].shape[-1])

@@ -9,14 +9,17 @@ from redig.envs.maps import ObstacleMap, corridor
 from redig.envs.navigation import FormationNavigation
 from redig.envs.occupancy import OccupancyMap, load_occupancy_map
 from redig.envs.random_maps import EVALUATION_MAPS, MAP_KINDS, named_map, random_map
+from redig.envs.randomisation import ActionDelay, ObservationNoise
 
 __all__ = [
     "EVALUATION_MAPS",
     "FORMATIONS",
     "MAP_KINDS",
     "ActionCheck",
+    "ActionDelay",
     "FormationNavigation",
     "MapBatch",
+    "ObservationNoise",
     "ObstacleMap",
     "OccupancyMap",
     "bollards",

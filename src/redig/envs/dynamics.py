@@ -17,6 +17,9 @@ class VelocityCommand(Dynamics):
         dt: time step (s).
         max_speed: limit on the norm of the command (m/s).
 
+    Attributes:
+        acceleration: a limit of each environment's own beside that of ``max_f``, ``[B, 1]`` (m/s²), or ``None``.
+
     Examples:
         >>> import torch
         >>> from vmas.simulator.core import Agent, World
@@ -34,6 +37,7 @@ class VelocityCommand(Dynamics):
         super().__init__()
         self.dt = dt
         self.max_speed = max_speed
+        self.acceleration: Tensor | None = None
 
     @property
     def needed_action_size(self) -> int:
@@ -43,11 +47,14 @@ class VelocityCommand(Dynamics):
     def process_action(self) -> None:
         """Turn the command of the agent into a force."""
         command = limit_norm(self.agent.action.u[:, :2], self.max_speed)
-        self.agent.state.force = self.agent.mass * (command - self.agent.state.vel) / self.dt
+        acceleration = (command - self.agent.state.vel) / self.dt
+        if self.acceleration is not None:
+            acceleration = limit_norm(acceleration, self.acceleration)
+        self.agent.state.force = self.agent.mass * acceleration
 
 
-def limit_norm(vector: Tensor, limit: float) -> Tensor:
-    """Shorten vectors ``[*B, 2]`` to a norm of at most ``limit``, keeping their direction.
+def limit_norm(vector: Tensor, limit: float | Tensor) -> Tensor:
+    """Shorten vectors ``[*B, 2]`` to a norm of at most ``limit`` (``[*B, 1]`` or a number), keeping their direction.
 
     Examples:
         >>> import torch

@@ -8,6 +8,7 @@ from vmas.simulator.scenario import BaseScenario
 
 from redig.envs.action_check import ActionCheck
 from redig.envs.navigation import FormationNavigation
+from redig.envs.randomisation import ActionDelay, ObservationNoise
 
 
 def make_env(
@@ -18,6 +19,8 @@ def make_env(
     device: torch.device | str = "cpu",
     reward_scale: float = 1.0,
     scenario: BaseScenario | None = None,
+    action_delay: tuple[int, int] = (0, 0),
+    observation_noise: float = 0.0,
     **scenario_kwargs: object,
 ) -> TransformedEnv:
     """Formation navigation as a TorchRL environment; a time-out truncates and does not terminate.
@@ -29,10 +32,12 @@ def make_env(
         device: of the simulation.
         reward_scale: factor on the reward.
         scenario: what to simulate; by default :class:`~redig.envs.FormationNavigation`.
+        action_delay: smallest and largest delay of commands (steps), see :class:`~redig.envs.ActionDelay`.
+        observation_noise: standard deviation, see :class:`~redig.envs.ObservationNoise`; 0: none.
         scenario_kwargs: arguments of the scenario.
 
     Raises:
-        ValueError: for ``num_envs`` or ``max_steps`` below 1, and for bad arguments of the scenario.
+        ValueError: for ``num_envs`` or ``max_steps`` below 1, a bad delay or noise, and bad arguments of the scenario.
 
     Examples:
         >>> env = make_env(4, formation="line", n_robots=3)
@@ -49,7 +54,10 @@ def make_env(
         device=device,
         **scenario_kwargs,
     )
-    transforms = [ActionCheck(), StepCounter(max_steps)]
+    delay = [] if tuple(action_delay) == (0, 0) else [ActionDelay(*action_delay)]
+    transforms = [*delay, ActionCheck(), StepCounter(max_steps)]  # actions pass from last to first
     if reward_scale != 1:
         transforms.append(RewardScaling(loc=0.0, scale=reward_scale, in_keys=[("agents", "reward")]))
+    if observation_noise != 0:
+        transforms.append(ObservationNoise(observation_noise))
     return TransformedEnv(base, Compose(*transforms))

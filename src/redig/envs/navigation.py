@@ -36,7 +36,8 @@ class FormationNavigation(BaseScenario):
     * ``start_distance`` (m): from the map's centre to the centre of the start and of the goal formation, along
       ``corridor_angle``; on a map with a route, its ends say where both are and how they head. ``position_jitter`` (m)
       and ``heading_jitter`` (rad): half ranges of what is added to each.
-    * ``radius`` (m), ``max_speed`` (m/s), ``max_acceleration`` (m/s²), ``dt`` (s): the robots.
+    * ``radius`` (m), ``max_speed`` (m/s), ``max_acceleration`` (m/s²), ``dt`` (s): the robots. ``acceleration_range``:
+      smallest and largest factor on ``max_acceleration``, drawn for each team at its reset; ``None``: 1.
     * ``observe_direction``: add the unit vector to the nearest obstacle (9 numbers); ``False`` gives the paper's 7.
     * ``formation_reward``: one of ``spring_damper`` (Eq. 29), ``spring_damper_bonus``, ``scaled``, ``slanted``,
       ``none``; ``formation_weight``; ``omega``. The frame of ``scaled`` and ``slanted`` is the goal formation's
@@ -98,6 +99,10 @@ class FormationNavigation(BaseScenario):
         self.direction = torch.zeros(batch_dim, 2, device=device)
         self.arrived = torch.zeros(batch, dtype=torch.bool, device=device)
         self.held = torch.zeros(batch_dim, dtype=torch.long, device=device)
+        self.acceleration = torch.full((batch_dim, 1), float(self.max_acceleration), device=device)
+        if self.acceleration_range is not None:
+            for agent in world.agents:
+                agent.dynamics.acceleration = self.acceleration
         self._quantities: dict[str, Tensor] | None = None
         return world
 
@@ -113,6 +118,10 @@ class FormationNavigation(BaseScenario):
         self.heading_jitter = take("heading_jitter", 0.1)
         self.radius, self.dt = take("radius", 0.1), take("dt", 0.1)
         self.max_speed, self.max_acceleration = take("max_speed", 1.0), take("max_acceleration", 2.0)
+        self.acceleration_range = take("acceleration_range", None)
+        low, high = self.acceleration_range or (1, 1)
+        if not 0 < low <= high <= 1:
+            raise ValueError(f"acceleration_range: got {self.acceleration_range}, must be 0 < low <= high <= 1")
         self.observe_direction = take("observe_direction", True)
         self.formation_reward = take("formation_reward", "spring_damper")
         self.formation_weight, self.omega = take("formation_weight", 1.0), take("omega", 0.5)
@@ -174,6 +183,10 @@ class FormationNavigation(BaseScenario):
         self.goal[index] = goal
         self.arrived[index] = False
         self.held[index] = 0
+        if self.acceleration_range is not None:
+            low, high = self.acceleration_range
+            factor = low + (high - low) * torch.rand_like(self.acceleration[index])
+            self.acceleration[index] = self.max_acceleration * factor
         for i, agent in enumerate(self.world.agents):
             agent.set_pos(start[:, i] if env_index is None else start[0, i], batch_index=env_index)
             agent.set_vel(
@@ -327,13 +340,13 @@ class FormationNavigation(BaseScenario):
 
     def state_dict(self) -> dict[str, Tensor]:
         """Everything that the next step depends on, so that a run can be resumed exactly."""
-        state = {name: getattr(self, name).clone() for name in ("goal", "direction", "arrived", "held")}
+        state = {name: getattr(self, name).clone() for name in ("goal", "direction", "arrived", "held", "acceleration")}
         return {"position": self._positions(), "velocity": self._velocities(), **state}
 
     def load_state_dict(self, state: dict[str, Tensor]) -> None:
         """Put the team where :meth:`state_dict` found it."""
-        for name in ("goal", "direction", "arrived", "held"):
-            setattr(self, name, state[name].clone())
+        for name in ("goal", "direction", "arrived", "held", "acceleration"):
+            getattr(self, name).copy_(state[name])
         for i, agent in enumerate(self.world.agents):
             agent.set_pos(state["position"][:, i], batch_index=None)
             agent.set_vel(state["velocity"][:, i], batch_index=None)

@@ -131,7 +131,8 @@ def team_model(
     <default class="ground"><geom contype="1" conaffinity="0" rgba=".93 .93 .9 1"/></default>
     <default class="chassis"><geom contype="2" conaffinity="3" friction="0.3"/></default>
     <default class="wheel">
-      <geom contype="0" conaffinity="1" priority="1" solref=".01 1" condim="3" friction="{ground.friction}" rgba=".2 .2 .2 1"/>
+      <geom contype="0" conaffinity="1" priority="1" solref=".01 1" condim="3" friction="{ground.friction}"
+            rgba=".2 .2 .2 1"/>
       <velocity kv="{body.gain}" forcerange="-{body.torque} {body.torque}"/>
     </default>
     <default class="caster">
