@@ -91,7 +91,9 @@ def test_acceleration_is_limited_for_each_team():
 
 def test_a_collection_resumes_exactly():
     env = make_env(3, action_delay=(0, 2), acceleration_range=(0.5, 1.0), n_robots=3)
-    collector = Collector(env, random_policy(), frames_per_batch=12, total_frames=-1, auto_register_policy_transforms=False)
+    collector = Collector(
+        env, random_policy(), frames_per_batch=12, total_frames=-1, auto_register_policy_transforms=False
+    )
     batches = iter(collector)
     next(batches)
     state, rng = collection_state(env, collector), torch.get_rng_state()

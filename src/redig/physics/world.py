@@ -49,9 +49,7 @@ class PhysicsWorld:
     ) -> None:
         self.body = body or RobotBody()
         self.n_robots, self.timestep = n_robots, timestep
-        self.model = mujoco.MjModel.from_xml_string(
-            team_model(obstacle_map, n_robots, self.body, ground, timestep)
-        )
+        self.model = mujoco.MjModel.from_xml_string(team_model(obstacle_map, n_robots, self.body, ground, timestep))
         self.data = mujoco.MjData(self.model)
         joints = [self.model.joint(f"robot_{i}") for i in range(n_robots)]
         self._pose = np.array([joint.qposadr[0] for joint in joints])
@@ -156,6 +154,18 @@ class PhysicsWorld:
         mujoco.mj_energyPos(self.model, self.data)
         mujoco.mj_energyVel(self.model, self.data)
         return float(self.data.energy.sum())
+
+    @property
+    def state(self) -> NDArray[np.float64]:
+        """Everything that the next step depends on, to be assigned again later."""
+        state = np.empty(mujoco.mj_stateSize(self.model, mujoco.mjtState.mjSTATE_INTEGRATION))
+        mujoco.mj_getState(self.model, self.data, state, mujoco.mjtState.mjSTATE_INTEGRATION)
+        return state
+
+    @state.setter
+    def state(self, state: ArrayLike) -> None:
+        mujoco.mj_setState(self.model, self.data, state, mujoco.mjtState.mjSTATE_INTEGRATION)
+        mujoco.mj_forward(self.model, self.data)
 
     def renderer(self, width: int = 960, height: int = 480) -> Any:
         """MuJoCo's renderer for this world; without a display set ``MUJOCO_GL=egl`` before the first import."""
