@@ -1,5 +1,6 @@
 import math
 
+import mujoco
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -16,6 +17,12 @@ def alone(heading=0.0, x=-8.0, y=0.0, **kwargs):
     world = PhysicsWorld(corridor(), 1, **kwargs)
     world.reset([[x, y]], [heading])
     return world
+
+
+def energy(world):
+    mujoco.mj_energyPos(world.model, world.data)
+    mujoco.mj_energyVel(world.model, world.data)
+    return world.data.energy.sum()
 
 
 def run(world, command, seconds, interval=0.1):
@@ -139,12 +146,12 @@ def test_a_ridge_lifts_robots_and_slows_them():
 def test_energy_comes_from_the_motors():
     world = alone()
     run(world, [[0.0, 0.0]], 0.5)  # settled
-    before, work = world.energy, 0.0
+    before, work = energy(world), 0.0
     for _ in range(100):
         speed = world.wheel_speed.ravel()
         world.step([[0.8, 0.0]], world.timestep)
         work += world.data.actuator_force @ (speed + world.wheel_speed.ravel()) / 2 * world.timestep
-    gained = world.energy - before
+    gained = energy(world) - before
     assert gained > 0.5 * BODY.mass * 0.75**2
     assert gained <= work <= 1.25 * gained
 
@@ -152,10 +159,10 @@ def test_energy_comes_from_the_motors():
 def test_a_robot_that_is_told_to_stand_stands():
     world = alone(x=-3.0, y=0.3)
     run(world, [[0.0, 0.0]], 0.5)
-    start, energy = world.position, world.energy
+    start, before = world.position, energy(world)
     run(world, [[0.0, 0.0]], 5.0)
     np.testing.assert_allclose(world.position, start, atol=1e-6)
-    assert world.energy == pytest.approx(energy, abs=1e-6)
+    assert energy(world) == pytest.approx(before, abs=1e-6)
 
 
 def test_equal_commands_give_equal_motion_also_after_a_reset():
@@ -173,17 +180,6 @@ def test_equal_commands_give_equal_motion_also_after_a_reset():
         for one, another in zip(ends[0], end, strict=True):
             np.testing.assert_array_equal(one, another)
     assert world.time == pytest.approx(2.0)
-
-
-def test_state_is_restored_exactly():
-    world = alone()
-    run(world, [[0.5, 1.0]], 0.7)
-    state = world.state
-    run(world, [[0.5, -1.0]], 0.7)
-    end = world.position
-    world.state = state
-    run(world, [[0.5, -1.0]], 0.7)
-    np.testing.assert_array_equal(world.position, end)
 
 
 @pytest.mark.parametrize(

@@ -1,7 +1,7 @@
 """What separates a simulator from robots, as TorchRL transforms: commands that come late and sensors that are noisy.
 
-Together with ``acceleration_range`` of :class:`~redig.envs.FormationNavigation` they keep a team in training from relying
-on one simulator. Noise and delays are drawn from torch's generator.
+Together with ``acceleration_range`` of :class:`~redig.envs.FormationNavigation` they keep a team in training from
+relying on one simulator. Noise and delays are drawn from torch's generator.
 """
 
 from __future__ import annotations

@@ -17,7 +17,7 @@ from redig.evaluation.diffusion_bound import (
     prior_mismatch,
     prior_mismatch_floor,
 )
-from redig.evaluation.evaluate import evaluate, evaluate_teams, rollout_trajectories
+from redig.evaluation.evaluate import evaluate, evaluate_teams, rollout_trajectories, team_metrics
 from redig.evaluation.message_importance import message_importance
 from redig.evaluation.metrics import (
     contextual_formation_integrity,
@@ -52,6 +52,7 @@ __all__ = [
     "rollout_trajectories",
     "statistical_error",
     "success",
+    "team_metrics",
     "team_success",
     "travel_time",
     "write_metrics",

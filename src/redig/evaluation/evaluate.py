@@ -35,9 +35,10 @@ def rollout_trajectories(
         exploration_type: of the policy.
 
     Returns:
-        TensorDict ``[E, T]`` of ``position`` ``[E, T, n, 2]`` (m), ``velocity`` (m/s), and, all bool, ``arrived`` and
-        ``collision`` ``[E, T, n]`` and ``mask`` ``[E, T]``. The first of the T samples is the start, so T is at most
-        ``max_steps + 1``. ``mask`` is true until the team is done; what follows repeats its last sample.
+        TensorDict ``[E, T]`` of ``position`` ``[E, T, n, 2]`` (m), ``velocity`` and the ``command`` that led to it
+        (m/s; zeros at the start), and, all bool, ``arrived`` and ``collision`` ``[E, T, n]`` and ``mask`` ``[E, T]``.
+        The first of the T samples is the start, so T is at most ``max_steps + 1``. ``mask`` is true until the team is
+        done; what follows repeats its last sample.
 
     Raises:
         ValueError: if there is no horizon, or it is not positive.
@@ -64,6 +65,7 @@ def rollout_trajectories(
         {
             "position": info["position"],
             "velocity": info["velocity"],
+            "command": torch.cat([torch.zeros_like(info["velocity"][:, :1]), data["agents", "action"]], 1),
             "arrived": info["arrived"].squeeze(-1) > 0,
             "collision": info["collision"].squeeze(-1) > 0,
             "mask": ~ended_before,
@@ -162,15 +164,36 @@ def evaluate_teams(
     teams: dict[str, list[Tensor]] = {}
     for run in range(-(-num_starts // num_envs)):
         trajectories = rollout_trajectories(policy, env, seed + run, max_steps, exploration_type)
-        for key, value in _team_metrics(trajectories, scenario, deltas).items():
+        for key, value in team_metrics(trajectories, scenario, deltas).items():
             teams.setdefault(key, []).append(value)
     return {key: torch.cat(values)[:num_starts] for key, values in teams.items()}
 
 
-def _team_metrics(
-    trajectories: TensorDictBase, scenario: FormationNavigation, deltas: Sequence[float]
+def team_metrics(
+    trajectories: TensorDictBase, scenario: FormationNavigation, deltas: Sequence[float] = (0.5, 0.1, 0.03)
 ) -> dict[str, Tensor]:
-    """Every metric of :func:`evaluate` for each team, ``[E]``."""
+    """Every metric of :func:`evaluate` for each team.
+
+    Args:
+        trajectories: as :func:`rollout_trajectories` returns them, ``[E, T]``; of ``velocity`` and ``command`` it has
+            no need.
+        scenario: whose formation, map, radius and time step count.
+        deltas: tolerances of the CFI (m).
+
+    Returns:
+        ``[E]`` each, NaN where there is nothing to measure.
+
+    Examples:
+        >>> from redig.envs import make_env
+        >>> scenario = make_env(1, formation="line").scenario
+        >>> position = torch.linspace(-2, 2, 5)[:, None] * torch.eye(2)[1] + torch.arange(8.0)[None, :, None, None] / 10
+        >>> arrived = torch.zeros(1, 8, 5, dtype=torch.bool)
+        >>> arrived[:, 7:] = True
+        >>> still = torch.zeros_like(arrived)
+        >>> team = {"position": position, "arrived": arrived, "collision": still, "mask": ~still[..., 0]}
+        >>> round(team_metrics(TensorDict(team, [1, 8]), scenario)["travel_time"].item(), 3)
+        0.7
+    """
     position, arrived, collision = (trajectories[key] for key in ("position", "arrived", "collision"))
     reached = success(arrived, collision)
     time = travel_time(arrived, scenario.dt)

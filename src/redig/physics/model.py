@@ -124,7 +124,7 @@ def team_model(
     motors = "".join(f'\n    <velocity name="{wheel}" joint="{wheel}" class="wheel"/>' for wheel in wheels)
     ridge_mesh, ridge = _ridge(ground) if ground.ridge_height > 0 else ("", "")
     return f"""<mujoco model="team">
-  <option timestep="{timestep}" integrator="implicitfast"><flag energy="enable"/></option>
+  <option timestep="{timestep}" integrator="implicitfast"/>
   <visual><global offwidth="1280" offheight="960"/><map znear="0.01"/></visual>
   <default>
     <default class="wall"><geom contype="2" conaffinity="0" friction="0.3" rgba=".72 .72 .72 1"/></default>

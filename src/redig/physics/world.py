@@ -148,25 +148,6 @@ class PhysicsWorld:
         """Of left and right wheels, ``[n, 2]`` (rad/s)."""
         return self.data.actuator_velocity.reshape(-1, 2).copy()
 
-    @property
-    def energy(self) -> float:
-        """Potential and kinetic energy (J)."""
-        mujoco.mj_energyPos(self.model, self.data)
-        mujoco.mj_energyVel(self.model, self.data)
-        return float(self.data.energy.sum())
-
-    @property
-    def state(self) -> NDArray[np.float64]:
-        """Everything that the next step depends on, to be assigned again later."""
-        state = np.empty(mujoco.mj_stateSize(self.model, mujoco.mjtState.mjSTATE_INTEGRATION))
-        mujoco.mj_getState(self.model, self.data, state, mujoco.mjtState.mjSTATE_INTEGRATION)
-        return state
-
-    @state.setter
-    def state(self, state: ArrayLike) -> None:
-        mujoco.mj_setState(self.model, self.data, state, mujoco.mjtState.mjSTATE_INTEGRATION)
-        mujoco.mj_forward(self.model, self.data)
-
     def renderer(self, width: int = 960, height: int = 480) -> Any:
         """MuJoCo's renderer for this world; without a display set ``MUJOCO_GL=egl`` before the first import."""
         return mujoco.Renderer(self.model, height, width)
