@@ -22,7 +22,7 @@ PUBLIC = [
     "redig",
     *(
         f"redig.{name}"
-        for name in ("modules", "objectives", "envs", "planning", "baselines", "evaluation", "viz", "deploy")
+        for name in ("modules", "objectives", "envs", "planning", "baselines", "evaluation", "viz", "deploy", "physics")
     ),
 ]
 

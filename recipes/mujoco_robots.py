@@ -1,0 +1,152 @@
+"""Robots in MuJoCo, each driven by a process of its own over DDS: ``python recipes/mujoco_robots.py --domain-id 7``."""
+
+from __future__ import annotations
+
+import signal
+import sys
+import time
+from contextlib import ExitStack
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import torch
+import tyro
+from robots import Robot
+from tensordict import TensorDict
+
+from redig.deploy.dds import DDSWorld
+from redig.envs.factory import make_env
+from redig.envs.navigation import FormationNavigation
+from redig.evaluation import format_table, team_metrics, write_metrics
+from redig.physics import PhysicsWorld
+from redig.physics.live import LiveTeam
+from redig.policy import read_header
+from redig.viz import animate, plot_trajectories
+
+TICK = 0.02  # s of physics between two states
+SILENCE = 2.0  # s before a start, in which robots forget where the others were at the end of the last one
+
+
+@dataclass
+class Arguments:
+    """One process owns the physics; one ``redig-robot`` for each robot drives it, knowing its own state and what its
+    neighbours say. Starts, goals, ends and metrics are those of recipes/mujoco_crossing.py.
+    """
+
+    domain_id: int
+    """DDS domain, one that nobody else uses; with ROS 2, ROS_DOMAIN_ID."""
+    policy: Path = Path("recipes/policies/wedge.safetensors")
+    """Policy file of the robots: .safetensors, or .onnx of one robot with --scenario."""
+    scenario: Path | None = None
+    """Policy file (.safetensors) of whose scenario the world is; default: the policy itself."""
+    starts: int = 10
+    """Number of starts, one after the other."""
+    seed: int = 2_000_000
+    """Seed of the starts, as in recipes/mujoco_crossing.py."""
+    speed: float = 1.0
+    """How much faster than real time the world runs; the robots' rate and timeouts go with it."""
+    rate: float = 20.0
+    """Commands per simulated second of each robot (Hz)."""
+    drive: str = "limo"
+    """Drive of the robots, see redig-robot --help; it must be one with wheels."""
+    spawn: bool = True
+    """Start the robots; --no-spawn: they are started by hand, or elsewhere."""
+    out: Path = Path("runs/mujoco-robots")
+    """Folder for metrics.json, pictures and the robots' logs."""
+
+
+class WheeledRobot(Robot):
+    """The process of one robot with wheels."""
+
+    def __init__(self, arguments: Arguments, robot: str, robots: list[str]) -> None:
+        super().__init__(arguments, robot, robots)
+        self._command += ["--drive", arguments.drive, "--deadline", str(0.1 / arguments.speed)]
+
+
+def wait_for(robots: list[str], network: DDSWorld, timeout: float = 300.0) -> None:
+    """Wait until every robot has sent a command.
+
+    Raises:
+        TimeoutError: naming the robots that have not, after ``timeout`` (s).
+    """
+    silent, given_up = set(robots), time.monotonic() + timeout
+    while silent:
+        if time.monotonic() > given_up:
+            raise TimeoutError(f"no command from {', '.join(sorted(silent))} after {timeout:g} s; see their logs")
+        time.sleep(0.1)
+        silent -= set(network.commands())
+
+
+def cross(team: LiveTeam, scenario: FormationNavigation, start: int, speed: float, max_steps: int = 200) -> TensorDict:
+    """One start in real time, over ``speed``: a trajectory ``[1, T]`` as of ``rollout_trajectories``, and ``late`` (s).
+
+    ``late`` is how far the world was behind its clock at most; then it was slower than it should have been.
+    """
+    position = scenario._positions()[start].numpy()
+    goal = scenario.goal[start].numpy()
+    ahead = goal - position
+    time.sleep(SILENCE / speed)
+    team.reset(position, np.arctan2(ahead[:, 1], ahead[:, 0]), goal, time.time())
+    due, late = time.monotonic(), 0.0
+    arrived, held = np.zeros(team.world.n_robots, bool), 0
+    samples = [(team.world.position, team.world.velocity, arrived, np.zeros_like(arrived))]
+    while held < scenario.hold_steps and len(samples) <= max_steps:
+        collision = np.zeros_like(arrived)
+        for _ in range(round(scenario.dt / TICK)):
+            due += TICK / speed
+            time.sleep(max(due - time.monotonic(), 0.0))
+            late = max(late, time.monotonic() - due)
+            team.step(TICK, time.time())
+            collision |= team.world.wall_contact | team.world.robot_contact
+        near = np.linalg.norm(goal - team.world.position, axis=-1) < scenario.goal_radius
+        arrived = arrived | near
+        held = held + 1 if arrived.all() else 0
+        samples.append((team.world.position, team.world.velocity, arrived, collision))
+    keys = ("position", "velocity", "arrived", "collision")
+    fields = {k: torch.as_tensor(np.stack(v)[None]) for k, v in zip(keys, zip(*samples, strict=True), strict=True)}
+    fields |= {k: fields[k].float() for k in ("position", "velocity")}
+    mask = torch.ones(1, len(samples), dtype=torch.bool)
+    return TensorDict({**fields, "mask": mask, "late": torch.full_like(mask, late, dtype=torch.float32)}, mask.shape)
+
+
+def main(arguments: Arguments) -> dict[str, float]:
+    """Start the robots, let the team cross from each start, print and write the metrics."""
+    signal.signal(signal.SIGTERM, lambda *_: sys.exit(143))  # the robots must stop with their world
+    _, options = read_header(arguments.scenario or arguments.policy)
+    env = make_env(arguments.starts, **options)
+    env.set_seed(arguments.seed)
+    env.reset()
+    scenario: FormationNavigation = env.scenario
+    robots = [f"robot_{i}" for i in range(scenario.n_robots)]
+    arguments.out.mkdir(parents=True, exist_ok=True)
+    network = DDSWorld(robots, domain_id=arguments.domain_id)
+    world = PhysicsWorld(scenario.obstacle_map, scenario.n_robots)
+    team = LiveTeam(world, scenario.obstacle_map, robots, network)
+    runs = []
+    with ExitStack() as stack:
+        if arguments.spawn:
+            for robot in robots:
+                stack.enter_context(WheeledRobot(arguments, robot, robots))
+        wait_for(robots, network)
+        for start in range(arguments.starts):
+            runs.append(cross(team, scenario, start, arguments.speed))
+            print(f"start {start}: {runs[-1]['arrived'][0, -1].sum()} arrived", flush=True)
+    network.close()
+    teams = [team_metrics(run, scenario) for run in runs]
+    metrics = {key: torch.cat([team[key] for team in teams]).nanmean().item() for key in teams[0]}
+    metrics |= {
+        "num_starts": float(arguments.starts),
+        "times_real_time": arguments.speed,
+        "late": max(run["late"].max().item() for run in runs),
+    }
+    print(format_table(metrics))
+    write_metrics(arguments.out / "metrics.json", metrics)
+    first, goal = runs[0]["position"][0], scenario.goal[0]
+    for draw, name in ((plot_trajectories, "crossing.png"), (animate, "crossing.mp4")):
+        draw(arguments.out / name, first, scenario.formation, scenario.obstacle_map, goal)
+    return metrics
+
+
+if __name__ == "__main__":
+    main(tyro.cli(Arguments))
