@@ -10,7 +10,6 @@ from typing import Any, Literal
 
 import imageio.v2 as imageio
 import mujoco
-import numpy as np
 import tyro
 from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModuleBase
@@ -115,9 +114,9 @@ def film(path: Path, policy: TensorDictModuleBase, scenario: dict[str, Any], see
     env = make_env(1, scenario=PhysicsNavigation(), **scenario)
     team = env.scenario.teams[0]
     camera = mujoco.MjvCamera()
-    camera.lookat[:], camera.distance, camera.azimuth, camera.elevation = (0.0, 0.0, 0.0), 6.5, 90.0, -50.0
+    camera.lookat[:], camera.distance, camera.azimuth, camera.elevation = (0.0, 0.0, 0.0), 5.6, 90.0, -50.0
     renderer = team.renderer(960, 544)
-    frames: list[np.ndarray] = []
+    frames: list[Any] = []
 
     def shoot(*_: object) -> None:
         renderer.update_scene(team.data, camera)

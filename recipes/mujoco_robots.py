@@ -1,4 +1,4 @@
-"""Robots in MuJoCo, each driven by a process of its own over DDS: ``python recipes/mujoco_robots.py --domain-id 7``."""
+"""Robots in MuJoCo, each driven by a process over DDS: ``python recipes/mujoco_robots.py POLICY --domain-id 7``."""
 
 from __future__ import annotations
 
@@ -12,6 +12,7 @@ from pathlib import Path
 import numpy as np
 import torch
 import tyro
+from robots import Arguments as WorldArguments
 from robots import Robot
 from tensordict import TensorDict
 
@@ -29,29 +30,15 @@ SILENCE = 2.0  # s before a start, in which robots forget where the others were 
 
 
 @dataclass
-class Arguments:
+class Arguments(WorldArguments):
     """One process owns the physics; one ``redig-robot`` for each robot drives it, knowing its own state and what its
-    neighbours say. Starts, goals, ends and metrics are those of recipes/mujoco_crossing.py.
+    neighbours say. Starts, goals, ends and metrics are those of recipes/mujoco_crossing.py with as many starts.
     """
 
-    domain_id: int
-    """DDS domain, one that nobody else uses; with ROS 2, ROS_DOMAIN_ID."""
-    policy: Path = Path("recipes/policies/wedge.safetensors")
-    """Policy file of the robots: .safetensors, or .onnx of one robot with --scenario."""
-    scenario: Path | None = None
-    """Policy file (.safetensors) of whose scenario the world is; default: the policy itself."""
-    starts: int = 10
-    """Number of starts, one after the other."""
-    seed: int = 2_000_000
-    """Seed of the starts, as in recipes/mujoco_crossing.py."""
-    speed: float = 1.0
-    """How much faster than real time the world runs; the robots' rate and timeouts go with it."""
     rate: float = 20.0
     """Commands per simulated second of each robot (Hz)."""
     drive: str = "limo"
     """Drive of the robots, see redig-robot --help; it must be one with wheels."""
-    spawn: bool = True
-    """Start the robots; --no-spawn: they are started by hand, or elsewhere."""
     out: Path = Path("runs/mujoco-robots")
     """Folder for metrics.json, pictures and the robots' logs."""
 

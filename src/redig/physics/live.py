@@ -15,7 +15,7 @@ from redig.envs.maps import ObstacleMap
 from redig.physics.world import PhysicsWorld
 
 
-class Network(Protocol):
+class _Network(Protocol):
     """The robots' network, seen from the world; over ROS 2 a :class:`redig.deploy.dds.DDSWorld`."""
 
     def publish(self, sensed: Sensed) -> None:
@@ -63,7 +63,7 @@ class LiveTeam:
         world: PhysicsWorld,
         obstacle_map: ObstacleMap,
         robots: Sequence[str],
-        network: Network,
+        network: _Network,
         limits: tuple[float, float] = (1.2, 6.0),
         watchdog: float = 0.5,
     ) -> None:

@@ -125,9 +125,10 @@ def team_model(
     ridge_mesh, ridge = _ridge(ground) if ground.ridge_height > 0 else ("", "")
     return f"""<mujoco model="team">
   <option timestep="{timestep}" integrator="implicitfast"/>
-  <visual><global offwidth="1280" offheight="960"/><map znear="0.01"/></visual>
+  <visual><global offwidth="1280" offheight="960"/><map znear="0.01"/>
+    <headlight ambient=".45 .45 .45" diffuse=".25 .25 .25" specular="0 0 0"/></visual>
   <default>
-    <default class="wall"><geom contype="2" conaffinity="0" friction="0.3" rgba=".72 .72 .72 1"/></default>
+    <default class="wall"><geom contype="2" conaffinity="0" friction="0.3" rgba=".55 .57 .6 1"/></default>
     <default class="ground"><geom contype="1" conaffinity="0" rgba=".93 .93 .9 1"/></default>
     <default class="chassis"><geom contype="2" conaffinity="3" friction="0.3"/></default>
     <default class="wheel">
@@ -143,7 +144,7 @@ def team_model(
   </default>
   <asset>{ridge_mesh}</asset>
   <worldbody>
-    <light pos="-3 -3 6" dir=".5 .5 -1" castshadow="false"/><light pos="3 3 6" dir="-.5 -.5 -1" castshadow="false"/>
+    <light directional="true" pos="-3 -3 8" dir=".4 .5 -1" diffuse=".4 .4 .4" specular="0 0 0"/>
     <geom name="ground" class="ground" type="plane" size="0 0 1"/>{ridge}{named}{robots}
   </worldbody>
   <actuator>{motors}

@@ -82,8 +82,8 @@ class PhysicsNavigation(FormationNavigation):
 
     def _settle(self) -> tuple[Tensor, Tensor, Tensor]:
         """Let MuJoCo carry out the commands from where it was; what VMAS made of them is replaced."""
-        command = torch.stack([agent.action.u for agent in self.world.agents], 1)
-        command = limit_norm(command, self.max_speed).double().cpu().numpy()
+        action = torch.stack([agent.action.u for agent in self.world.agents], 1)
+        command = limit_norm(action, self.max_speed).double().cpu().numpy()
         touched = np.stack([self._drive(*each) for each in zip(self.teams, self.drives, command, strict=True)])
         position = self.goal.new_tensor(np.stack([team.position for team in self.teams]))
         velocity = self.goal.new_tensor(np.stack([team.velocity for team in self.teams]))
