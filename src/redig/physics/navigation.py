@@ -11,7 +11,10 @@ from vmas.simulator.core import World
 from redig.deploy.drive import Base, DifferentialDrive
 from redig.envs import rewards
 from redig.envs.dynamics import limit_norm
+from redig.envs.map_batch import map_at
+from redig.envs.maps import ObstacleMap
 from redig.envs.navigation import FormationNavigation
+from redig.envs.occupancy import OccupancyMap
 from redig.physics.model import RobotBody
 from redig.physics.world import PhysicsWorld
 
@@ -57,7 +60,8 @@ class PhysicsNavigation(FormationNavigation):
         if body.radius != self.radius:
             raise ValueError(f"body: got a radius of {body.radius} m, that of the scenario is {self.radius} m")
         base = base or base_of(body, self.max_speed, self.max_acceleration)
-        self.teams = [PhysicsWorld(self.obstacle_map, self.n_robots, body, ground) for _ in range(batch_dim)]
+        maps = [map_at(self.obstacle_map, i) for i in range(batch_dim)]
+        self.teams = [PhysicsWorld(boxes(each), self.n_robots, body, ground) for each in maps]
         self.drives = [[DifferentialDrive(base, gain=gain) for _ in range(self.n_robots)] for _ in range(batch_dim)]
         return world
 
@@ -103,6 +107,22 @@ class PhysicsNavigation(FormationNavigation):
             )
             touched |= [team.wall_contact, team.robot_contact]
         return touched
+
+
+def boxes(obstacle_map: ObstacleMap | OccupancyMap) -> ObstacleMap:
+    """The map, if it is one of boxes.
+
+    Raises:
+        ValueError: if it is a grid, of which there is no model.
+
+    Examples:
+        >>> from redig.envs import corridor
+        >>> boxes(corridor(0.9)).gap
+        0.9
+    """
+    if not isinstance(obstacle_map, ObstacleMap):
+        raise ValueError(f"obstacle_map: got {type(obstacle_map).__name__}, MuJoCo's model is of ObstacleMap only")
+    return obstacle_map
 
 
 def base_of(body: RobotBody, max_speed: float, max_acceleration: float) -> Base:
