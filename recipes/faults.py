@@ -244,20 +244,21 @@ def draw(rows: Sequence[dict[str, str]]) -> Figure:
     for place, (sweep, cases) in zip((grid[0, 0], grid[0, 1], grid[1, :]), CASES.items(), strict=True):
         axes = figure.add_subplot(place)
         mine = [row for row in rows if row["sweep"] == sweep]
+        measured = [value for value in cases if any(row["value"] == str(value) for row in mine)]
         for number, (rate, label) in enumerate(zip(RATES, ("robots", "whole teams"), strict=True)):
-            values = [[float(row[rate]) for row in mine if row["value"] == str(value)] for value in cases]
+            values = [[float(row[rate]) for row in mine if row["value"] == str(value)] for value in measured]
             middle = [statistics.mean(at) for at in values]
             spread = [[m - min(at) for m, at in zip(middle, values, strict=True)]]
             spread += [[max(at) - m for m, at in zip(middle, values, strict=True)]]
             if sweep == "fault":
                 bars(axes, number, middle, spread, label)
             else:
-                places = [float(value) for value in cases]
+                places = [float(value) for value in measured]
                 axes.errorbar(
                     places, middle, spread, color=PALETTE[number], marker="os"[number], ms=4, capsize=2, label=label
                 )
         if sweep == "fault":
-            axes.set_yticks(range(len(cases)), list(cases), size=8)  # type: ignore[arg-type]
+            axes.set_yticks(range(len(measured)), measured, size=8)  # type: ignore[arg-type]
             axes.invert_yaxis()
             axes.set_xlim(0, 1.03)
             axes.set_xlabel("success rate", size=9)

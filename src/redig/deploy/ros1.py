@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import sys
+import time
 from collections import deque
 from collections.abc import Callable, Sequence
 from functools import partial
@@ -92,6 +93,7 @@ class ROS1Transport:
 
     def close(self) -> None:
         """Leave the graph."""
+        time.sleep(0.1)  # what was published last, a command to stand, is sent by a thread of rospy
         self._ros.rospy.signal_shutdown("closed")
 
 
