@@ -198,45 +198,67 @@ def measure(case: Case, policy: RobotPolicy, arguments: Arguments, seed: int) ->
     return evaluate(TensorDictModule(act, [OBSERVATION], [ACTION]), env, seed=arguments.first_seed + seed)
 
 
-def main(arguments: Arguments) -> list[dict[str, object]]:
-    """Measure all cases, and write ``faults.csv`` and ``faults.png``."""
+def main(arguments: Arguments) -> list[dict[str, str]]:
+    """Measure all cases that ``faults.csv`` does not have yet, add them to it, and draw ``faults.png``."""
     logging.getLogger("redig").setLevel(logging.CRITICAL)  # thousands of robots report their faults
-    policy = RobotPolicy(arguments.policy)
-    rows: list[dict[str, object]] = []
-    for sweep, cases in CASES.items():
-        for value, case in cases.items():
-            for seed in range(arguments.seeds):
+    policy, file = RobotPolicy(arguments.policy), arguments.out / "faults.csv"
+    rows = read(file)
+    done = {(row["sweep"], row["value"], row["seed"]) for row in rows}
+    for seed in range(arguments.seeds):
+        for sweep, cases in CASES.items():
+            for value, case in cases.items():
+                point = {"sweep": sweep, "value": str(value), "seed": str(seed)}
+                if tuple(point.values()) in done:
+                    continue
                 metrics = measure(case, policy, arguments, seed)
-                rows.append({"sweep": sweep, "value": value, "seed": seed, **metrics})
-                print(sweep, value, seed, *(f"{metrics[rate]:.3f}" for rate in RATES), flush=True)
-    with replacing(arguments.out / "faults.csv") as path, open(path, "w", newline="") as file:
-        writer = csv.DictWriter(file, fieldnames=list(rows[0]))
-        writer.writeheader()
-        writer.writerows(rows)
+                rows.append(
+                    {**point, "starts": str(arguments.starts), **{rate: f"{metrics[rate]:.4f}" for rate in RATES}}
+                )
+                print(*rows[-1].values(), flush=True)
+                write(file, rows)
     with replacing(arguments.out / "faults.png") as path:
         draw(rows).savefig(path, dpi=200)
     return rows
 
 
-def draw(rows: Sequence[dict[str, object]]) -> Figure:
+def read(file: Path) -> list[dict[str, str]]:
+    """What has been measured before."""
+    if not file.is_file():
+        return []
+    with open(file, newline="") as lines:
+        return list(csv.DictReader(lines))
+
+
+def write(file: Path, rows: Sequence[dict[str, str]]) -> None:
+    """All rows, in place of what was there."""
+    with replacing(file) as path, open(path, "w", newline="") as lines:
+        writer = csv.DictWriter(lines, fieldnames=list(rows[0]))
+        writer.writeheader()
+        writer.writerows(rows)
+
+
+def draw(rows: Sequence[dict[str, str]]) -> Figure:
     """Success over loss and over delay, and for each of the other faults; bars and bands span the seeds."""
     figure = Figure(figsize=(9.0, 6.0), layout="constrained")
     grid = figure.add_gridspec(2, 2, height_ratios=(1, 1.2))
     for place, (sweep, cases) in zip((grid[0, 0], grid[0, 1], grid[1, :]), CASES.items(), strict=True):
         axes = figure.add_subplot(place)
         mine = [row for row in rows if row["sweep"] == sweep]
+        measured = [value for value in cases if any(row["value"] == str(value) for row in mine)]
         for number, (rate, label) in enumerate(zip(RATES, ("robots", "whole teams"), strict=True)):
-            values = [[float(row[rate]) for row in mine if row["value"] == value] for value in cases]  # type: ignore
+            values = [[float(row[rate]) for row in mine if row["value"] == str(value)] for value in measured]
             middle = [statistics.mean(at) for at in values]
             spread = [[m - min(at) for m, at in zip(middle, values, strict=True)]]
             spread += [[max(at) - m for m, at in zip(middle, values, strict=True)]]
             if sweep == "fault":
                 bars(axes, number, middle, spread, label)
             else:
-                style = {"color": PALETTE[number], "marker": "os"[number], "markersize": 4, "capsize": 2}
-                axes.errorbar([float(value) for value in cases], middle, spread, label=label, linewidth=1.3, **style)
+                places = [float(value) for value in measured]
+                axes.errorbar(
+                    places, middle, spread, color=PALETTE[number], marker="os"[number], ms=4, capsize=2, label=label
+                )
         if sweep == "fault":
-            axes.set_yticks(range(len(cases)), list(cases), size=8)  # type: ignore[arg-type]
+            axes.set_yticks(range(len(measured)), measured, size=8)  # type: ignore[arg-type]
             axes.invert_yaxis()
             axes.set_xlim(0, 1.03)
             axes.set_xlabel("success rate", size=9)

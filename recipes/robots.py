@@ -17,6 +17,7 @@ from torch import Tensor
 
 from redig.deploy.dds import DDSWorld
 from redig.deploy.messages import RobotState
+from redig.deploy.record import Recorder
 from redig.deploy.transport import BodyVelocity, Sensed
 from redig.envs.factory import make_env
 from redig.evaluation import evaluate, format_table, write_metrics
@@ -45,6 +46,8 @@ class Arguments:
     """Commands per simulated second of each robot (Hz)."""
     spawn: bool = True
     """Start the robots; --no-spawn: they are started by hand, or elsewhere."""
+    record: Path | None = None
+    """Record all starts in this MCAP file (needs redig[record])."""
     out: Path = Path("runs/robots")
     """Folder for metrics.json and the robots' logs."""
 
@@ -57,10 +60,14 @@ class RemoteTeam:
         robots: their namespaces, in the order of the formation.
         step: real time from states to commands (s).
         watchdog: after which a robot without a command stands (s).
+        recorder: of what the robots sense and are commanded.
     """
 
-    def __init__(self, world: DDSWorld, robots: list[str], step: float, watchdog: float) -> None:
+    def __init__(
+        self, world: DDSWorld, robots: list[str], step: float, watchdog: float, recorder: Recorder | None = None
+    ) -> None:
         self._world, self._robots, self._step, self._watchdog = world, robots, step, watchdog
+        self._recorder = recorder
         self._commands: dict[str, tuple[float, BodyVelocity]] = {}
         self._goal = torch.zeros(0)
         self._due = 0.0
@@ -71,16 +78,23 @@ class RemoteTeam:
         if self._goal.shape != goal.shape or not torch.allclose(goal, self._goal, atol=1e-3):
             self._new_start(goal)
         now = time.time()
-        for robot, row in zip(self._robots, observation[0].tolist(), strict=True):
-            x, y, vx, vy, gx, gy, distance, ox, oy = row
-            self._world.publish(
-                Sensed(RobotState(robot, now, (x, y), (vx, vy), (x + gx, y + gy), distance, (ox, oy)), heading=0.0)
-            )
+        team = [self._sensed(robot, now, row) for robot, row in zip(self._robots, observation[0].tolist(), strict=True)]
+        for sensed in team:
+            self._world.publish(sensed)
         self._due = max(self._due + self._step, time.monotonic())
         time.sleep(max(self._due - time.monotonic(), 0))
         heard = time.monotonic()
         self._commands |= {robot: (heard, command) for robot, command in self._world.commands().items()}
-        return torch.tensor([[self._current(robot, heard) for robot in self._robots]])
+        commands = [self._current(robot, heard) for robot in self._robots]
+        if self._recorder is not None:
+            for sensed, (forward, left) in zip(team, commands, strict=True):
+                self._recorder.write(sensed, BodyVelocity(forward, left, 0.0))
+        return torch.tensor([commands])
+
+    @staticmethod
+    def _sensed(robot: str, now: float, row: list[float]) -> Sensed:
+        x, y, vx, vy, gx, gy, distance, ox, oy = row
+        return Sensed(RobotState(robot, now, (x, y), (vx, vy), (x + gx, y + gy), distance, (ox, oy)), heading=0.0)
 
     def _current(self, robot: str, now: float) -> tuple[float, float]:
         at, command = self._commands.get(robot, (-float("inf"), BodyVelocity(0.0, 0.0, 0.0)))
@@ -107,14 +121,29 @@ def main(arguments: Arguments) -> dict[str, float]:
         if arguments.spawn:
             for robot in robots:
                 stack.enter_context(Robot(arguments, robot, robots))
-            time.sleep(5.0)
-        team = RemoteTeam(world, robots, step, watchdog)
+        wait_for(world, robots)
+        recorder = None if arguments.record is None else stack.enter_context(Recorder(arguments.record))
+        team = RemoteTeam(world, robots, step, watchdog, recorder)
         policy = TensorDictModule(team, [OBSERVATION], [ACTION])
         metrics = evaluate(policy, env, seed=arguments.seed, num_starts=arguments.starts)
     world.close()
     print(format_table(metrics))
     write_metrics(arguments.out / "metrics.json", metrics)
     return metrics
+
+
+def wait_for(world: DDSWorld, robots: list[str], seconds: float = 600.0) -> None:
+    """Until each robot has been heard.
+
+    Raises:
+        TimeoutError: naming those that are not.
+    """
+    end, silent = time.monotonic() + seconds, set(robots)
+    while silent:
+        if time.monotonic() > end:
+            raise TimeoutError(f"no command from {', '.join(sorted(silent))} in {seconds:g} s; their logs may say why")
+        time.sleep(0.05)
+        silent -= set(world.commands())
 
 
 class Robot:
@@ -141,7 +170,12 @@ class Robot:
 
     def __exit__(self, *_: object) -> None:
         self._process.terminate()
-        if self._process.wait(timeout=10) != 0:
+        try:
+            code = self._process.wait(timeout=60)
+        except subprocess.TimeoutExpired:
+            self._process.kill()
+            code = self._process.wait()
+        if code != 0:
             print(f"{self._log.stem} has failed; see {self._log}")
 
 

@@ -19,7 +19,7 @@ import pytest
 pytest.importorskip("cyclonedds", reason="needs pip install 'redig[ros2]'")
 
 from redig.deploy import ros2_types
-from redig.deploy.dds import DDSTransport, DDSWorld, Network, Reader, StateWriter
+from redig.deploy.dds import DDSTransport, DDSWorld, Network, _Reader, _StateWriter
 from redig.deploy.events import Events
 from redig.deploy.messages import RobotState
 from redig.deploy.node import RobotNode
@@ -141,7 +141,7 @@ class Torn:
 
 def test_bytes_that_cannot_be_decoded_are_passed_over_and_logged_once(caplog):
     error = UnicodeDecodeError("utf-8", b"\xff", 0, 1, "invalid start byte")
-    reader = Reader(Torn(["a", error, error, "left", "b"]), Events(logging.getLogger("test")))
+    reader = _Reader(Torn(["a", error, error, "left", "b"]), Events(logging.getLogger("test")))
     assert [sample.text for sample in reader.take()] == ["a", "b"] and list(reader.take()) == []
     assert len(caplog.records) == 1 and "rt/robot_1/team/pose that cannot be decoded" in caplog.text
 
@@ -160,7 +160,7 @@ def test_what_arrives_between_two_looks_stays_in_step(world, transport):
 
 def test_other_domains_are_not_heard(transport):
     network = Network(DOMAIN + 1)
-    writer = StateWriter(network, "robot_1/team")
+    writer = _StateWriter(network, "robot_1/team")
     for _ in range(20):
         writer.write(Sensed(MATE, 0.0), "map")
         time.sleep(0.02)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import logging
 import signal
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from threading import Event
@@ -17,16 +18,22 @@ from redig.deploy.pilot import Deadline, Pilot
 from redig.deploy.robot import RobotPolicy
 from redig.deploy.transport import Transport
 
+DESCRIPTION = """Drive one robot of a team with a trained policy.
+
+It reads the robot's own pose, twist, goal and nearest obstacle from topics in its namespace, tells them to its
+neighbours on topics under team/, hears theirs, and publishes cmd_vel (geometry_msgs/Twist, along the robot's axes). It
+publishes zero while its own state is stale, and never more than its limits. Run one such process for each robot.
+
+Nothing on the network is authenticated: whoever reaches it can send states. The default reaches this machine only."""
+
 
 @dataclass
 class Arguments:
-    """Drive one robot of a team with a trained policy.
+    """Options of ``redig-robot``; their help is under each.
 
-    It reads the robot's own pose, twist, goal and nearest obstacle from topics in its namespace, tells them to its
-    neighbours on team_state, hears theirs, and publishes cmd_vel (geometry_msgs/Twist, along the robot's axes). It
-    publishes zero while its own state is stale, and never more than its limits. Run one such process for each robot.
-
-    Nothing on the network is authenticated: whoever reaches it can send states. The default reaches this machine only.
+    Examples:
+        >>> Arguments(Path("robot.onnx"), "robot_0").rate
+        20.0
     """
 
     policy: Path
@@ -71,14 +78,23 @@ class Arguments:
     """How the robot moves: in all directions, or with the differential drive and the limits of such a base."""
 
 
-def main() -> None:
-    """Entry point of ``redig-robot``."""
+def main(args: Sequence[str] | None = None) -> None:
+    """Entry point of ``redig-robot``; ``args`` are those of the command line.
+
+    Examples:
+        >>> main("--policy no/such/robot.onnx --namespace robot_0 --domain-id 7".split())
+        Traceback (most recent call last):
+        ...
+        FileNotFoundError: policy: no such file: no/such/robot.onnx
+    """
     logging.basicConfig(format="%(asctime)s %(levelname)s %(message)s", level=logging.INFO)
-    arguments = tyro.cli(Arguments, prog="redig-robot")
-    stop = Event()
-    for number in (signal.SIGINT, signal.SIGTERM):
-        signal.signal(number, lambda *_: stop.set())
-    run(arguments, stop)
+    arguments, stop = tyro.cli(Arguments, prog="redig-robot", description=DESCRIPTION, args=args), Event()
+    before = {number: signal.signal(number, lambda *_: stop.set()) for number in (signal.SIGINT, signal.SIGTERM)}
+    try:
+        run(arguments, stop)
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)
 
 
 def run(arguments: Arguments, stop: Event) -> None:
@@ -88,6 +104,12 @@ def run(arguments: Arguments, stop: Event) -> None:
         ValueError: for an argument that is not allowed.
         FileNotFoundError: if there is no such policy.
         ImportError: naming the extra that is not installed.
+
+    Examples:
+        >>> run(Arguments(Path("no/such/robot.onnx"), "robot_0", domain_id=7), Event())
+        Traceback (most recent call last):
+        ...
+        FileNotFoundError: policy: no such file: no/such/robot.onnx
     """
     policy = RobotPolicy(arguments.policy)
     trained = policy.environment
@@ -109,14 +131,26 @@ def run(arguments: Arguments, stop: Event) -> None:
 
 
 def make_drive(arguments: Arguments) -> Drive:
-    """How this robot moves."""
+    """How this robot moves.
+
+    Examples:
+        >>> make_drive(Arguments(Path("robot.onnx"), "robot_0"))((0.5, 0.25), 0.0)
+        BodyVelocity(forward=0.5, left=0.25, turn=0.0)
+    """
     if arguments.drive == "holonomic":
         return holonomic
     return Wheels(DifferentialDrive({"limo": LIMO, "warthog": WARTHOG}[arguments.drive]))
 
 
 def make_transport(arguments: Arguments) -> Transport:
-    """The network that the arguments ask for."""
+    """The network that the arguments ask for.
+
+    Examples:
+        >>> make_transport(Arguments(Path("robot.onnx"), "robot_0"))
+        Traceback (most recent call last):
+        ...
+        ValueError: domain_id: got None; ROS 2 needs --domain-id, the same for the whole team
+    """
     given = {name: getattr(arguments, f"{name}_topic") for name in ("pose", "twist", "goal", "obstacle")}
     topics = given | {"cmd_vel": arguments.command_topic}
     if arguments.ros == 1:

@@ -73,6 +73,12 @@ class DDSTransport:
     Raises:
         ValueError: for a domain id or a name that is not allowed.
         DDSException: if there is no such interface, or this process has the domain on another one.
+
+    Examples:
+        >>> transport = DDSTransport("robot_0", ["robot_1"], domain_id=7)
+        >>> transport.sense() is None  # nobody has told it where it is
+        True
+        >>> transport.close()
     """
 
     def __init__(
@@ -91,13 +97,13 @@ class DDSTransport:
         mates = [check_namespace("neighbours", mate) for mate in neighbours]
         names = {name: full_name(robot, name, topics or {}) for name in (*STATE_TOPICS, "cmd_vel")}
         self._network = Network(domain_id, interface, peers)
-        self._own = StateReader(self._network, StateParts(robot, goal, obstacle), names)
+        self._own = _StateReader(self._network, StateParts(robot, goal, obstacle), names)
         self._mates = [
-            StateReader(self._network, StateParts(mate), {name: f"{mate}/team/{name}" for name in STATE_TOPICS})
+            _StateReader(self._network, StateParts(mate), {name: f"{mate}/team/{name}" for name in STATE_TOPICS})
             for mate in mates
             if mate != robot
         ]
-        self._states = StateWriter(self._network, f"{robot}/team")
+        self._states = _StateWriter(self._network, f"{robot}/team")
         self._commands = self._network.writer(names["cmd_vel"], Twist)
 
     def sense(self) -> Sensed | None:
@@ -133,12 +139,20 @@ class DDSWorld:
 
     Raises:
         ValueError: likewise.
+
+    Examples:
+        >>> world = DDSWorld(["robot_0"], domain_id=7)
+        >>> state = RobotState("robot_0", 1.5, (0.0, 1.0), (0.3, 0.0), (5.5, 1.0), 0.8, (0.0, -1.0))
+        >>> world.publish(Sensed(state, heading=0.0))
+        >>> world.commands()  # no robot has come yet
+        {}
+        >>> world.close()
     """
 
     def __init__(self, robots: Sequence[str], *, domain_id: int, interface: str = "lo", peers: Sequence[str] = ()):
         names = [check_namespace("robots", robot) for robot in robots]
         self._network = Network(domain_id, interface, peers)
-        self._states = {name: StateWriter(self._network, name) for name in names}
+        self._states = {name: _StateWriter(self._network, name) for name in names}
         self._commands = {name: self._network.reader(f"{name}/cmd_vel", Twist) for name in names}
 
     def publish(self, sensed: Sensed) -> None:
@@ -162,7 +176,7 @@ class DDSWorld:
         self._network.close()
 
 
-class StateReader:
+class _StateReader:
     """The state of a robot, out of four topics.
 
     Args:
@@ -195,8 +209,8 @@ class StateReader:
         return states
 
 
-class StateWriter:
-    """The other end of :class:`StateReader`, for topics of the same names in ``namespace``."""
+class _StateWriter:
+    """The other end of :class:`_StateReader`, for topics of the same names in ``namespace``."""
 
     def __init__(self, network: Network, namespace: str) -> None:
         self._write = {name: network.writer(f"{namespace}/{name}", kind).write for name, kind in STATE_TOPICS.items()}
@@ -220,6 +234,12 @@ class Network:
 
     Attributes:
         events: what has been logged.
+
+    Examples:
+        >>> Network(233)
+        Traceback (most recent call last):
+        ...
+        ValueError: domain_id: got 233, must be from 0 to 232
     """
 
     def __init__(self, domain_id: int, interface: str = "lo", peers: Sequence[str] = ()) -> None:
@@ -233,17 +253,17 @@ class Network:
         """A reliable writer of the ROS topic of this name."""
         return DataWriter(self._participant, Topic(self._participant, f"rt/{topic}", kind), RELIABLE)
 
-    def reader(self, topic: str, kind: type) -> Reader:
+    def reader(self, topic: str, kind: type) -> _Reader:
         """A best-effort reader of the ROS topic of this name."""
         qos = Qos(Policy.Reliability.BestEffort, Policy.History.KeepLast(DEPTH))
-        return Reader(DataReader(self._participant, Topic(self._participant, f"rt/{topic}", kind), qos), self.events)
+        return _Reader(DataReader(self._participant, Topic(self._participant, f"rt/{topic}", kind), qos), self.events)
 
     def close(self) -> None:
         """Leave the domain, once nothing holds a reader or writer."""
         del self._participant
 
 
-class Reader:
+class _Reader:
     """Messages of a topic; one that cannot be decoded is passed over."""
 
     def __init__(self, reader: DataReader, events: Events) -> None:

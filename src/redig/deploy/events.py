@@ -10,7 +10,7 @@ from dataclasses import dataclass
 
 
 @dataclass
-class Event:
+class _Event:
     """When something last happened and was last logged (s), whether it goes on, and whether its begin was logged."""
 
     at: float
@@ -42,12 +42,12 @@ class Events:
 
     def __init__(self, log: logging.Logger, quiet: float = 10.0, clock: Callable[[], float] = time.monotonic) -> None:
         self._log, self._quiet, self._clock = log, quiet, clock
-        self._seen: dict[str, Event] = {}
+        self._seen: dict[str, _Event] = {}
 
     def begin(self, event: str, message: str) -> None:
         """It happens now; ``message`` is logged as a warning if that is new."""
         now = self._clock()
-        seen = self._seen.setdefault(event, Event(now, -math.inf, on=False, told=False))
+        seen = self._seen.setdefault(event, _Event(now, -math.inf, on=False, told=False))
         goes_on = seen.on and now - seen.at <= self._quiet
         if not goes_on:
             seen.told = now - seen.logged > self._quiet

@@ -16,7 +16,7 @@ log = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True)
-class Heard:
+class _Heard:
     """A message, when it came (s, the receiver's clock) and the least lag of its sender's messages (s)."""
 
     state: RobotState
@@ -59,7 +59,7 @@ class Hearing:
                 raise ValueError(f"{name}: got {value}, must be greater than 0")
         self._robots, self._timeout, self._fastest = set(robots), timeout, fastest
         self._events = Events(log) if events is None else events
-        self._heard: dict[str, Heard] = {}
+        self._heard: dict[str, _Heard] = {}
 
     def hear(self, state: RobotState, now: float) -> bool:
         """Take a message that came at ``now`` (s, a clock that never goes back); returns whether it is believed."""
@@ -72,7 +72,7 @@ class Hearing:
         last, lag = self._heard.get(state.robot), now - state.stamp
         if last is not None:
             lag = min(lag, last.lag + DRIFT * (now - last.at))
-        self._heard[state.robot] = Heard(state, now, lag)
+        self._heard[state.robot] = _Heard(state, now, lag)
         self._events.end(f"lost {state.robot}", f"hearing {state.robot} again")
         return True
 

@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import sys
+import time
 from collections import deque
 from collections.abc import Callable, Sequence
 from functools import partial
+from types import SimpleNamespace
 from typing import Any
 
 from redig.deploy.messages import RobotState, Vector
@@ -13,17 +15,7 @@ from redig.deploy.ros_state import Obstacle, StateParts, check_namespace, full_n
 from redig.deploy.transport import BodyVelocity, Sensed
 
 DEBIAN = "/usr/lib/python3/dist-packages"  # behind the environment's own packages, never ahead of them
-sys.path += [DEBIAN] if DEBIAN not in sys.path else []
-try:
-    import rospy
-    from geometry_msgs.msg import Point, Pose, PoseStamped, Quaternion, Twist, TwistStamped, Vector3, Vector3Stamped
-    from std_msgs.msg import Header
-except ImportError as error:
-    raise ImportError(
-        "redig.deploy.ros1 needs rospy and geometry_msgs of ROS 1: apt install python3-rospy python3-geometry-msgs"
-    ) from error
-
-STATE_TOPICS = {"pose": PoseStamped, "twist": TwistStamped, "goal": PoseStamped, "obstacle": Vector3Stamped}
+STATE_TOPICS = ("pose", "twist", "goal", "obstacle")
 DEPTH = 8  # messages of one topic that are kept between two looks
 
 
@@ -38,6 +30,13 @@ class ROS1Transport:
 
     Raises:
         ValueError: for a name that is not allowed.
+        ImportError: if there is no ROS 1 here.
+
+    Examples:
+        >>> ROS1Transport("robot-0", [])
+        Traceback (most recent call last):
+        ...
+        ValueError: namespace: got 'robot-0', must be letters, digits and underscores, such as robot_0 or fleet/robot_0
     """
 
     def __init__(
@@ -52,17 +51,18 @@ class ROS1Transport:
         robot = check_namespace("namespace", namespace)
         mates = [check_namespace("neighbours", mate) for mate in neighbours]
         names = {name: full_name(robot, name, topics or {}) for name in (*STATE_TOPICS, "cmd_vel")}
-        rospy.init_node(f"redig_{robot.replace('/', '_')}", disable_signals=True)
-        self._own = StateReader(StateParts(robot, goal, obstacle), names)
+        self._ros = ros = _import()
+        ros.rospy.init_node(f"redig_{robot.replace('/', '_')}", disable_signals=True)
+        self._own = _StateReader(ros, StateParts(robot, goal, obstacle), names)
         self._mates = [
-            StateReader(StateParts(mate), {name: f"{mate}/team/{name}" for name in STATE_TOPICS})
+            _StateReader(ros, StateParts(mate), {name: f"{mate}/team/{name}" for name in STATE_TOPICS})
             for mate in mates
             if mate != robot
         ]
         self._states = {
-            name: rospy.Publisher(f"/{robot}/team/{name}", kind, queue_size=1) for name, kind in STATE_TOPICS.items()
+            name: ros.rospy.Publisher(f"/{robot}/team/{name}", ros.kinds[name], queue_size=1) for name in STATE_TOPICS
         }
-        self._commands = rospy.Publisher(f"/{names['cmd_vel']}", Twist, queue_size=1)
+        self._commands = ros.rospy.Publisher(f"/{names['cmd_vel']}", ros.messages.Twist, queue_size=1)
 
     def sense(self) -> Sensed | None:
         """This robot's own state, once all of its parts have come anew."""
@@ -71,13 +71,14 @@ class ROS1Transport:
 
     def send(self, sensed: Sensed) -> None:
         """Publish a state for neighbours, in the frame of the pose."""
-        state, heading = sensed
-        header = Header(stamp=rospy.Time.from_sec(state.stamp), frame_id=self._own.parts.frame)
+        (state, heading), of = sensed, self._ros.messages
+        stamp = self._ros.rospy.Time.from_sec(state.stamp)
+        header = self._ros.header(stamp=stamp, frame_id=self._own.parts.frame)
         distance, (x, y) = state.obstacle_distance, state.obstacle_direction
-        place = Pose(Point(*state.position, 0.0), Quaternion(*to_quaternion(heading)))
-        self._states["twist"].publish(header, Twist(linear=Vector3(*state.velocity, 0.0)))
-        self._states["goal"].publish(header, Pose(position=Point(*state.goal, 0.0)))
-        self._states["obstacle"].publish(header, Vector3(distance * x, distance * y, 0.0))
+        place = of.Pose(of.Point(*state.position, 0.0), of.Quaternion(*to_quaternion(heading)))
+        self._states["twist"].publish(header, of.Twist(linear=of.Vector3(*state.velocity, 0.0)))
+        self._states["goal"].publish(header, of.Pose(position=of.Point(*state.goal, 0.0)))
+        self._states["obstacle"].publish(header, of.Vector3(distance * x, distance * y, 0.0))
         self._states["pose"].publish(header, place)
 
     def receive(self) -> list[RobotState]:
@@ -86,24 +87,26 @@ class ROS1Transport:
 
     def command(self, velocity: BodyVelocity) -> None:
         """Publish a ``Twist``."""
-        message = Twist()
+        message = self._ros.messages.Twist()
         message.linear.x, message.linear.y, message.angular.z = velocity
         self._commands.publish(message)
 
     def close(self) -> None:
         """Leave the graph."""
-        rospy.signal_shutdown("closed")
+        time.sleep(0.1)  # what was published last, a command to stand, is sent by a thread of rospy
+        self._ros.rospy.signal_shutdown("closed")
 
 
-class StateReader:
+class _StateReader:
     """The state of a robot, out of four topics; rospy calls back in threads of its own, where only a queue is touched.
 
     Args:
+        ros: what :func:`_import` gives.
         parts: what puts them together.
         topics: names of ``pose``, ``twist``, ``goal`` and ``obstacle``.
     """
 
-    def __init__(self, parts: StateParts, topics: dict[str, str]) -> None:
+    def __init__(self, ros: SimpleNamespace, parts: StateParts, topics: dict[str, str]) -> None:
         self.parts = parts
         self._hear: dict[str, Callable[[Any], None]] = {
             "twist": parts.hear_twist,
@@ -112,8 +115,8 @@ class StateReader:
             "pose": lambda message: parts.hear_pose(message, message.header.stamp.to_sec()),
         }
         self._queue: deque[tuple[str, Any]] = deque(maxlen=4 * DEPTH)
-        for name, kind in STATE_TOPICS.items():
-            rospy.Subscriber(f"/{topics[name]}", kind, partial(self._put, name))
+        for name in STATE_TOPICS:
+            ros.rospy.Subscriber(f"/{topics[name]}", ros.kinds[name], partial(self._put, name))
 
     def take(self) -> list[Sensed]:
         """States that have been completed since the last call."""
@@ -128,3 +131,20 @@ class StateReader:
 
     def _put(self, name: str, message: Any) -> None:
         self._queue.append((name, message))
+
+
+def _import() -> SimpleNamespace:
+    """What is needed of ROS 1, where the system has it."""
+    if DEBIAN not in sys.path:
+        sys.path.append(DEBIAN)
+    try:
+        import rospy
+        from geometry_msgs import msg as messages
+        from std_msgs.msg import Header
+    except ImportError as error:
+        raise ImportError(
+            "redig.deploy.ros1 needs rospy and geometry_msgs of ROS 1: apt install python3-rospy python3-geometry-msgs"
+        ) from error
+    pose = messages.PoseStamped
+    kinds = {"pose": pose, "twist": messages.TwistStamped, "goal": pose, "obstacle": messages.Vector3Stamped}
+    return SimpleNamespace(rospy=rospy, messages=messages, header=Header, kinds=kinds)

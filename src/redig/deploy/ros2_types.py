@@ -15,7 +15,12 @@ except ImportError as error:
 
 @dataclass
 class Time(IdlStruct, typename="builtin_interfaces::msg::dds_::Time_"):
-    """``builtin_interfaces/Time``."""
+    """``builtin_interfaces/Time``.
+
+    Examples:
+        >>> Time(1, 500_000_000).seconds()
+        1.5
+    """
 
     sec: int32 = 0
     nanosec: uint32 = 0
@@ -33,7 +38,12 @@ class Time(IdlStruct, typename="builtin_interfaces::msg::dds_::Time_"):
 
 @dataclass
 class Header(IdlStruct, typename="std_msgs::msg::dds_::Header_"):
-    """``std_msgs/Header``."""
+    """``std_msgs/Header``.
+
+    Examples:
+        >>> Header(Time(1), "map").frame_id
+        'map'
+    """
 
     stamp: Time = field(default_factory=Time)
     frame_id: str = ""
@@ -41,7 +51,12 @@ class Header(IdlStruct, typename="std_msgs::msg::dds_::Header_"):
 
 @dataclass
 class Vector3(IdlStruct, typename="geometry_msgs::msg::dds_::Vector3_"):
-    """``geometry_msgs/Vector3``."""
+    """``geometry_msgs/Vector3``.
+
+    Examples:
+        >>> Vector3(0.5).y
+        0.0
+    """
 
     x: float64 = 0.0
     y: float64 = 0.0
@@ -50,7 +65,12 @@ class Vector3(IdlStruct, typename="geometry_msgs::msg::dds_::Vector3_"):
 
 @dataclass
 class Point(IdlStruct, typename="geometry_msgs::msg::dds_::Point_"):
-    """``geometry_msgs/Point``."""
+    """``geometry_msgs/Point``.
+
+    Examples:
+        >>> Point(0.5).y
+        0.0
+    """
 
     x: float64 = 0.0
     y: float64 = 0.0
@@ -59,7 +79,12 @@ class Point(IdlStruct, typename="geometry_msgs::msg::dds_::Point_"):
 
 @dataclass
 class Quaternion(IdlStruct, typename="geometry_msgs::msg::dds_::Quaternion_"):
-    """``geometry_msgs/Quaternion``."""
+    """``geometry_msgs/Quaternion``.
+
+    Examples:
+        >>> Quaternion().w
+        1.0
+    """
 
     x: float64 = 0.0
     y: float64 = 0.0
@@ -69,7 +94,12 @@ class Quaternion(IdlStruct, typename="geometry_msgs::msg::dds_::Quaternion_"):
 
 @dataclass
 class Pose(IdlStruct, typename="geometry_msgs::msg::dds_::Pose_"):
-    """``geometry_msgs/Pose``."""
+    """``geometry_msgs/Pose``.
+
+    Examples:
+        >>> Pose(Point(0.5)).position.x
+        0.5
+    """
 
     position: Point = field(default_factory=Point)
     orientation: Quaternion = field(default_factory=Quaternion)
@@ -77,7 +107,12 @@ class Pose(IdlStruct, typename="geometry_msgs::msg::dds_::Pose_"):
 
 @dataclass
 class PoseStamped(IdlStruct, typename="geometry_msgs::msg::dds_::PoseStamped_"):
-    """``geometry_msgs/PoseStamped``."""
+    """``geometry_msgs/PoseStamped``.
+
+    Examples:
+        >>> PoseStamped(pose=Pose(Point(0.5))).pose.position.x
+        0.5
+    """
 
     header: Header = field(default_factory=Header)
     pose: Pose = field(default_factory=Pose)
@@ -85,7 +120,12 @@ class PoseStamped(IdlStruct, typename="geometry_msgs::msg::dds_::PoseStamped_"):
 
 @dataclass
 class Twist(IdlStruct, typename="geometry_msgs::msg::dds_::Twist_"):
-    """``geometry_msgs/Twist``."""
+    """``geometry_msgs/Twist``.
+
+    Examples:
+        >>> Twist(Vector3(0.5)).linear.x
+        0.5
+    """
 
     linear: Vector3 = field(default_factory=Vector3)
     angular: Vector3 = field(default_factory=Vector3)
@@ -93,7 +133,12 @@ class Twist(IdlStruct, typename="geometry_msgs::msg::dds_::Twist_"):
 
 @dataclass
 class TwistStamped(IdlStruct, typename="geometry_msgs::msg::dds_::TwistStamped_"):
-    """``geometry_msgs/TwistStamped``."""
+    """``geometry_msgs/TwistStamped``.
+
+    Examples:
+        >>> TwistStamped(twist=Twist(Vector3(0.5))).twist.linear.x
+        0.5
+    """
 
     header: Header = field(default_factory=Header)
     twist: Twist = field(default_factory=Twist)
@@ -101,7 +146,12 @@ class TwistStamped(IdlStruct, typename="geometry_msgs::msg::dds_::TwistStamped_"
 
 @dataclass
 class Vector3Stamped(IdlStruct, typename="geometry_msgs::msg::dds_::Vector3Stamped_"):
-    """``geometry_msgs/Vector3Stamped``."""
+    """``geometry_msgs/Vector3Stamped``.
+
+    Examples:
+        >>> Vector3Stamped(vector=Vector3(0.5)).vector.x
+        0.5
+    """
 
     header: Header = field(default_factory=Header)
     vector: Vector3 = field(default_factory=Vector3)

@@ -16,14 +16,25 @@ from redig.deploy.messages import RobotState
 
 
 class Sensed(NamedTuple):
-    """What a robot senses of itself: its state, and its heading (rad) from the x axis of the world."""
+    """What a robot senses of itself: its state, and its heading (rad) from the x axis of the world.
+
+    Examples:
+        >>> state = RobotState("robot_0", 0.0, (0.0, 0.0), (0.0, 0.0), (5.0, 0.0), 1.0, (0.0, 1.0))
+        >>> Sensed(state, heading=0.5).heading
+        0.5
+    """
 
     state: RobotState
     heading: float
 
 
 class BodyVelocity(NamedTuple):
-    """A command along the robot's own axes, as ROS's ``Twist`` has it: forward and left (m/s), turn (rad/s)."""
+    """A command along the robot's own axes, as ROS's ``Twist`` has it: forward and left (m/s), turn (rad/s).
+
+    Examples:
+        >>> BodyVelocity(0.5, 0.0, turn=0.1).forward
+        0.5
+    """
 
     forward: float
     left: float
@@ -31,7 +42,13 @@ class BodyVelocity(NamedTuple):
 
 
 class Transport(Protocol):
-    """What a node needs of a robot and of its radio. No call waits."""
+    """What a node needs of a robot and of its radio. No call waits.
+
+    Examples:
+        >>> transport: Transport = Radio().join("robot_0")
+        >>> transport.sense() is None
+        True
+    """
 
     def sense(self) -> Sensed | None:
         """This robot's own state, if there is a new one since the last call."""
@@ -144,6 +161,12 @@ class InProcessTransport:
     Attributes:
         sensed: what :meth:`sense` is to give next, set by the world.
         commanded: the last command, read by the world; at first to stand.
+
+    Examples:
+        >>> transport = Radio().join("robot_0")
+        >>> transport.command(BodyVelocity(0.5, 0.0, 0.0))
+        >>> transport.commanded.forward
+        0.5
     """
 
     def __init__(self, radio: Radio, robot: str) -> None:
