@@ -18,10 +18,12 @@ from tensordict import TensorDict
 
 from redig.deploy.dds import DDSWorld
 from redig.envs.factory import make_env
+from redig.envs.map_batch import map_at
 from redig.envs.navigation import FormationNavigation
 from redig.evaluation import format_table, team_metrics, write_metrics
 from redig.physics import PhysicsWorld
 from redig.physics.live import LiveTeam
+from redig.physics.navigation import boxes
 from redig.policy import read_header
 from redig.viz import animate, plot_trajectories
 
@@ -108,8 +110,9 @@ def main(arguments: Arguments) -> dict[str, float]:
     robots = [f"robot_{i}" for i in range(scenario.n_robots)]
     arguments.out.mkdir(parents=True, exist_ok=True)
     network = DDSWorld(robots, domain_id=arguments.domain_id)
-    world = PhysicsWorld(scenario.obstacle_map, scenario.n_robots)
-    team = LiveTeam(world, scenario.obstacle_map, robots, network)
+    obstacle_map = boxes(map_at(scenario.obstacle_map, 0))
+    world = PhysicsWorld(obstacle_map, scenario.n_robots)
+    team = LiveTeam(world, obstacle_map, robots, network)
     runs = []
     with ExitStack() as stack:
         if arguments.spawn:
@@ -131,7 +134,7 @@ def main(arguments: Arguments) -> dict[str, float]:
     write_metrics(arguments.out / "metrics.json", metrics)
     first, goal = runs[0]["position"][0], scenario.goal[0]
     for draw, name in ((plot_trajectories, "crossing.png"), (animate, "crossing.mp4")):
-        draw(arguments.out / name, first, scenario.formation, scenario.obstacle_map, goal)
+        draw(arguments.out / name, first, scenario.formation, obstacle_map, goal)
     return metrics
 
 
