@@ -16,7 +16,7 @@ METHODS: dict[str, dict[str, Any]] = {
 }
 SMOKE: dict[str, Any] = {  # the whole program in under a minute; it learns nothing
     "num_trajectories": 50, "clone_updates": 4, "frames": 640, "horizon": 20, "epochs": 1, "num_envs": 8,
-    "evaluation_interval": 20, "evaluation_starts": 8, "num_starts": 8, "hidden": 32,
+    "evaluation_interval": 40, "evaluation_starts": 8, "num_starts": 8, "hidden": 32,
 }  # fmt: skip
 
 
