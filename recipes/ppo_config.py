@@ -12,7 +12,7 @@ from config import REWARD, Task
 METHODS: dict[str, dict[str, Any]] = {
     "dgnn": {"formation_reward": "none"},
     "afor": {"formation_reward": "spring_damper"},
-    "afor_redig_reward": {"formation_reward": "scaled"},
+    "afor_redig_reward": {},
 }
 SMOKE: dict[str, Any] = {  # the whole program in under a minute; it learns nothing
     "num_trajectories": 50, "clone_updates": 4, "frames": 640, "horizon": 20, "epochs": 1, "num_envs": 8,
@@ -104,6 +104,7 @@ class PPOConfig(Task):
             raise ValueError(f"method: got {self.method!r}, allowed are {', '.join(METHODS)}")
         config = dataclasses.replace(self, **SMOKE) if self.smoke else self
         config = config.filled(METHODS[config.method]).filled(REWARD.get(config.formation, REWARD["wedge"]))
+        config = config.filled({"formation_reward": Task.formation_reward})
         config.check_positive(
             "num_envs", "horizon", "epochs", "batch_size", "hidden", "num_trajectories", "clone_batch",
             "evaluation_interval", "evaluation_starts", "num_starts",
