@@ -104,7 +104,12 @@ def load(arguments: Arguments, observation_dim: int) -> TensorDictSequential:
     if config.kind != "diffusion":
         if given:
             raise ValueError(f"{', '.join(given)}: {arguments.policy} holds a {config.kind} policy, which has no chain")
-        return load_policy(arguments.policy, observation_dim)
+        return load_policy(
+            arguments.policy,
+            observation_dim,
+            fixed_latent=arguments.fixed_latent,
+            warm_start=arguments.warm_start,
+        )
     config = replace(config, **given)
     sampler = build_sampler(config.sampler, config.sampling_steps, config.noise_ratio, config.early_stop, config.eta)
     return load_policy(

@@ -16,7 +16,7 @@ from typing import Any
 import ppo_gnn
 import tyro
 from finish import score
-from ppo_config import METHODS, PPOConfig
+from ppo_config import PPOConfig
 from seeds import numbers, write_csv
 
 OUT = Path("runs/ppo-tuning")
@@ -48,7 +48,7 @@ def row(folder: Path) -> dict[str, Any]:
         evaluations = [numbers(line) for line in csv.DictReader(file)]
     named = {name: config[name] for name in ("formation", "method", "seed")}
     preset = PPOConfig(formation=config["formation"], method=config["method"]).resolve()
-    defaults = {**asdict(preset), **METHODS[config["method"]]}
+    defaults = asdict(preset)
     changed = [
         f"{name}={value}"
         for name, value in config.items()

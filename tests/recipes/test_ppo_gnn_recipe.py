@@ -55,8 +55,12 @@ def test_the_policy_file_is_evaluated_by_the_same_command(smoke_ppo, tmp_path):
     path = smoke_ppo[0] / "policy.safetensors"
     metrics = evaluate_recipe.main(evaluate_recipe.Arguments(path, starts=4, out=tmp_path, animation=False))
     assert metrics["num_starts"] == 4
-    with pytest.raises(ValueError, match="sampling_steps: .* holds a gaussian policy"):
-        evaluate_recipe.main(evaluate_recipe.Arguments(path, starts=4, out=tmp_path, sampling_steps=3))
+    for options, message in (
+        ({"sampling_steps": 3}, "sampling_steps: .* holds a ppo policy"),
+        ({"fixed_latent": True}, "fixed_latent, warm_start: a ppo policy has no chain"),
+    ):
+        with pytest.raises(ValueError, match=message):
+            evaluate_recipe.main(evaluate_recipe.Arguments(path, starts=4, out=tmp_path, **options))
 
 
 def assert_same_run(first, second):
