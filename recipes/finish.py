@@ -18,10 +18,11 @@ TEST_SEED = 2_000_000  # starts of the final evaluation, the same for every trai
 
 
 def score(metrics: dict[str, float]) -> float:
-    """What the best policy has most of: whole teams that arrive, then formation, then speed, then smoothness."""
+    """What the best policy has most of: robots and teams that arrive, then formation, then speed, then smoothness."""
     time = metrics["travel_time"] if metrics["travel_time_teams"] > 0 else 20.0
     excess_jerk = max(metrics["jerk_mean"] - 2.0, 0.0)
-    return 4 * metrics["team_success_rate"] + metrics["cfi_0.5"] - 0.1 * time - 0.1 * excess_jerk
+    success = 2 * metrics["success_rate"] + 2 * metrics["team_success_rate"]
+    return success + metrics["cfi_0.5"] - 0.1 * time - 0.1 * excess_jerk
 
 
 def finish(run: Run, config: Task) -> dict[str, float]:

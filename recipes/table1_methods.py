@@ -37,6 +37,25 @@ METHODS: dict[str, Method] = {
     "dgnn": Method("DGNN (PPO)", "ppo_gnn.py", ("--method", "dgnn")),
     "afor": Method("AFOR (PPO, spring-damper)", "ppo_gnn.py", ("--method", "afor")),
     "afor_redig_reward": Method("AFOR with ReDiG's reward", "ppo_gnn.py", ("--method", "afor_redig_reward")),
+    "ppo_cloned": Method(
+        "the same, from a clone of ReDiG's demonstrations",
+        "ppo_gnn.py",
+        (
+            "--method",
+            "afor_redig_reward",
+            "--clone-updates",
+            "2000",
+            "--value-rounds",
+            "8",
+            "--initial-std",
+            "0.2",
+            "--lr",
+            "3e-4",
+        ),
+    ),
+    "redig_coordinated": Method(
+        "ReDiG, coordinated demonstrations", "redig_wedge.py", ("--planner", "virtual_structure")
+    ),
     "gaussian": Method("Gaussian actor, trained as ReDiG", "redig_wedge.py", ("--actor", "gaussian")),
     "deterministic": Method("deterministic actor, trained as ReDiG", "redig_wedge.py", ("--actor", "deterministic")),
     "cloned": Method("ReDiG before online training", of="redig", file="cloned.safetensors"),
