@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal
 
 import tyro
 from tensordict import TensorDictBase
@@ -16,6 +16,7 @@ from torchrl.envs.utils import ExplorationType
 
 from redig.checkpoint import load_checkpoint
 from redig.envs.factory import make_env
+from redig.envs.map_batch import map_at
 from redig.envs.random_maps import MAP_KINDS
 from redig.evaluation import evaluate, format_table, rollout_trajectories, write_metrics
 from redig.modules import BestOfN, DiffusionActor
@@ -72,9 +73,7 @@ def main(arguments: Arguments) -> dict[str, float]:
     _, scenario = read_header(arguments.policy)
     changes = {name: getattr(arguments, name) for name in ("formation", "n_robots", "corridor_width")}
     scenario |= {name: value for name, value in changes.items() if value is not None}
-    if (place := arguments.map or scenario.get("obstacle_map")) is not None:
-        kind = place.removesuffix(":train")
-        scenario["obstacle_map"] = f"{kind}:evaluation" if kind in MAP_KINDS else place
+    scenario = on_evaluation_maps(scenario, arguments.map)
     env = make_env(arguments.starts, **scenario)
     policy = load(arguments, env.observation_spec["agents", "observation"].shape[-1])
     driver: TensorDictModuleBase = policy
@@ -94,6 +93,18 @@ def main(arguments: Arguments) -> dict[str, float]:
         draw_crossing(arguments.out, driver, with_memory(make_env(1, **scenario), policy), arguments.seed)
     print(f"written to {arguments.out}")
     return metrics
+
+
+def on_evaluation_maps(scenario: dict[str, Any], place: str | None = None) -> dict[str, Any]:
+    """A scenario with the evaluation maps of the kind that it was trained on, or of another kind, or in another place.
+
+    What has neither map nor place is as it was.
+    """
+    place = place or scenario.get("obstacle_map")
+    if place is None:
+        return scenario
+    kind = place.removesuffix(":train")
+    return {**scenario, "obstacle_map": f"{kind}:evaluation" if kind in MAP_KINDS else place}
 
 
 def load(arguments: Arguments, observation_dim: int) -> TensorDictSequential:
@@ -149,8 +160,9 @@ def draw_crossing(folder: Path, policy: TensorDictModuleBase, env: TransformedEn
     rollout = rollout_trajectories(policy, env, seed)
     position = rollout["position"][0, rollout["mask"][0]]
     world = env.base_env.scenario
-    plot_trajectories(folder / "trajectories.png", position, world.formation, world.obstacle_map, world.goal[0])
-    animate(folder / "trajectories.gif", position, world.formation, world.obstacle_map, world.goal[0])
+    here = map_at(world.obstacle_map, 0)
+    plot_trajectories(folder / "trajectories.png", position, world.formation, here, world.goal[0])
+    animate(folder / "trajectories.gif", position, world.formation, here, world.goal[0])
 
 
 if __name__ == "__main__":

@@ -103,6 +103,18 @@ def test_direction_is_minus_the_gradient(yaw):
     assert close.float().mean() > 0.97  # not on the lines between cells, where the slope changes
 
 
+def test_gradients_are_finite_and_minus_the_direction():
+    """Inside the grid and beyond it, and half way between walls, where the distance is flat."""
+    grid = OccupancyMap(torch.zeros(6, 20, dtype=torch.bool), 0.1, (0.0, 0.0, 0.0), gap=0.6)
+    point = torch.tensor([[1.0, 0.1], [1.0, 0.45], [1.0, 0.3], [1.0, 0.9]], requires_grad=True)
+    distance, direction = grid.nearest(point)
+    (slope,) = torch.autograd.grad(distance.sum(), point, retain_graph=True)
+    torch.testing.assert_close(slope[[0, 1, 3]], -direction[[0, 1, 3]].detach())
+    torch.testing.assert_close(slope[2], torch.zeros(2))
+    (turning,) = torch.autograd.grad(direction.sum(), point)
+    torch.testing.assert_close(turning, torch.zeros(4, 2))  # straight walls
+
+
 def test_beyond_the_grid_is_wall():
     grid = OccupancyMap(torch.zeros(10, 20, dtype=torch.bool), 0.1, (0.0, 0.0, 0.0), gap=1.0)
     distance, direction = grid.nearest(torch.tensor([[1.0, -2.0], [5.0, 0.5], [1.0, 0.2]]))

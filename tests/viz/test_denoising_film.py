@@ -4,7 +4,7 @@ import pytest
 import torch
 from PIL import Image
 
-from redig.envs import corridor, formation_offsets
+from redig.envs import OccupancyMap, corridor, formation_offsets
 from redig.viz import animate_denoising
 
 PLACE = formation_offsets("wedge", 5) + torch.tensor([-2.0, 0.0])
@@ -27,6 +27,19 @@ def test_mp4_is_readable(tmp_path):
     frames = imageio.imread(tmp_path / "a.mp4")
     assert frames.shape[0] == 2
     assert frames.shape[1] % 16 == frames.shape[2] % 16 == 0
+
+
+def test_a_grid_looks_like_the_boxes_that_it_was_made_from(tmp_path):
+    centres = 0.05 * torch.arange(160) - 3.975
+    boxes, cells = corridor(), torch.cartesian_prod(centres, centres).flip(-1)
+    occupied = (boxes.signed_distance(cells) < 0).reshape(160, 160)
+    grid = OccupancyMap(occupied, 0.05, (-4.0, -4.0, 0.0), gap=1.1)
+    free = OccupancyMap(torch.zeros_like(occupied), 0.05, (-4.0, -4.0, 0.0), gap=1.1)
+    frames = []
+    for place in (boxes, grid, free):
+        animate_denoising(tmp_path / "a.gif", [0], torch.zeros(1, 8, 5, 2), PLACE, place, hold=0.1)
+        frames.append(imageio.imread(tmp_path / "a.gif")[0].astype(int))
+    assert np.abs(frames[1] - frames[0]).mean() < 0.1 * np.abs(frames[2] - frames[0]).mean()
 
 
 def test_bad_input_is_named(tmp_path):

@@ -7,7 +7,7 @@ from matplotlib.figure import Figure
 from matplotlib.patches import Circle, FancyArrowPatch
 from PIL import Image
 
-from redig.envs import corridor, formation_offsets
+from redig.envs import OccupancyMap, corridor, formation_offsets
 from redig.viz import plot_comparison, plot_denoising, plot_importance, plot_jerk
 from redig.viz.panels import ONE_COLUMN, TWO_COLUMNS, panel_grid
 
@@ -98,6 +98,20 @@ def test_importance_widens_with_the_value_on_one_scale(kept, tmp_path):
         assert np.allclose(arrows[-1]._posA_posB, place[0, [0, 2]])  # robot 2 hears robot 0 most
     assert np.allclose(2 * (np.array(widths[0]) - 0.3), np.array(widths[1]) - 0.3)
     assert np.allclose(grid[2, 0].get_xlim(), grid[0, 0].get_xlim())
+
+
+def test_maps_may_be_grids(kept, tmp_path, squeeze):
+    occupied = torch.zeros(40, 60, dtype=torch.bool)
+    occupied[:10, 25:35] = True
+    grid, team = OccupancyMap(occupied, 0.1, (-3.0, -2.0, 0.0), gap=1.0), squeeze()
+    touching = torch.zeros(team.shape[:2], dtype=torch.bool)
+    plot_comparison(tmp_path / "a.png", {"a": team, "b": team}, {"a": touching, "b": touching}, "wedge", grid)
+    plot_importance(tmp_path / "b.png", {"a": torch.rand(2, 5, 5)}, team[:2], ["now", "then"], grid)
+    for axes in (*kept[0].axes, *kept[1].axes[:2]):
+        (picture,) = axes.images
+        assert np.array_equal(picture.get_array(), occupied)
+        first_cell = (picture.get_transform() - axes.transData).transform((0.05, 0.05))
+        assert np.allclose(first_cell, (-2.95, -1.95))
 
 
 @pytest.mark.parametrize(("width", "pixels"), [(ONE_COLUMN, 680), (TWO_COLUMNS, 1400)])

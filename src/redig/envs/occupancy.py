@@ -93,9 +93,10 @@ class OccupancyMap:
         of the distance; where that vanishes, half way between walls, it is along x.
         """
         distance, x, y = self._interpolate(point)
+        flat = torch.hypot(x, y) < 1e-6
+        x, y = torch.where(flat, -1.0, x), torch.where(flat, 0.0, y)  # before dividing, so that gradients stay finite
         norm = torch.hypot(x, y)
-        flat = norm < 1e-6
-        x, y = torch.where(flat, -1.0, x / norm), torch.where(flat, 0.0, y / norm)
+        x, y = x / norm, y / norm
         cos, sin = math.cos(self.origin[2]), math.sin(self.origin[2])
         return distance, -torch.stack([cos * x - sin * y, sin * x + cos * y], -1)
 
@@ -113,7 +114,7 @@ class OccupancyMap:
         a, b, c, d = (field.flatten()[corner + step] for step in (0, 1, width, width + 1))
         inside = (1 - v) * ((1 - u) * a + u * b) + v * ((1 - u) * c + u * d)
         beyond_x, beyond_y = x - near_x, y - near_y
-        beyond = torch.hypot(beyond_x, beyond_y)
+        beyond = torch.stack([beyond_x, beyond_y], -1).norm(dim=-1)  # hypot has no gradient at 0
         outside = beyond > 0
         slope_x = torch.where(outside, -beyond_x, (1 - v) * (b - a) + v * (d - c))
         slope_y = torch.where(outside, -beyond_y, (1 - u) * (c - a) + u * (d - b))

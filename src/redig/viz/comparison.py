@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Mapping, Sequence
+from typing import Any
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -12,14 +13,15 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from redig.envs.maps import ObstacleMap
+from redig.envs.occupancy import OccupancyMap
 from redig.viz.panels import LEGEND, TWO_COLUMNS, panel_grid
 from redig.viz.scene import INK, SHAPE, check_trajectory, draw_map, formation_outline, save_figure, view
 from redig.viz.team import draw_formation, draw_paths, number_robots
 
 INSTANTS = 5
 LEAST_WIDTH = 3.0  # of a panel (inches)
-COLLISION = {"marker": "X", "s": 36, "color": INK, "edgecolors": "white", "linewidths": 0.7}
-PLATE = {"facecolor": "white", "edgecolor": "none", "pad": 0.5}
+COLLISION: dict[str, Any] = {"marker": "X", "s": 36, "color": INK, "edgecolors": "white", "linewidths": 0.7}
+PLATE: dict[str, Any] = {"facecolor": "white", "edgecolor": "none", "pad": 0.5}
 
 
 def plot_comparison(
@@ -27,7 +29,7 @@ def plot_comparison(
     position: Mapping[str, Tensor],
     collision: Mapping[str, Tensor],
     formation: str,
-    obstacle_map: ObstacleMap,
+    obstacle_map: ObstacleMap | OccupancyMap,
     goal: Tensor | None = None,
     radius: float = 0.1,
     dt: float = 0.1,
@@ -87,21 +89,22 @@ def plot_comparison(
     for axes, (name, track) in zip(panels, tracks.items(), strict=True):
         draw_map(axes, obstacle_map, region)
         axes.set_title(name, size=9, loc="left")
-        axes.xaxis.label.set_size(8)
-        axes.yaxis.label.set_size(8)
+        axes.xaxis.label.set_fontsize(8)
+        axes.yaxis.label.set_fontsize(8)
         axes.label_outer()
         draw_paths(axes, track, linewidth=1.1)
         for k in sorted({*instants, len(track) - 1}):
             draw_formation(axes, track[k], outline, radius, filled=k == 0)
             number_robots(axes, track[k], size=5, colour="white" if k == 0 else INK)
             _write_time(axes, track[k], k * dt, radius)
-        axes.scatter(*_contacts(track, touching[name]).T, zorder=7, **COLLISION)
+        x, y = _contacts(track, touching[name]).T
+        axes.scatter(x, y, zorder=7, **COLLISION)
         if goals is not None:
-            axes.scatter(*goals.T, marker="+", s=24, color=INK, linewidths=0.8, zorder=5)
+            axes.scatter(goals[:, 0], goals[:, 1], marker="+", s=24, color=INK, linewidths=0.8, zorder=5)
     handles = [Line2D([], [], color=SHAPE, linewidth=0.9, label=f"formation ({formation})")]
     if goals is not None:
         handles.append(Line2D([], [], color=INK, marker="+", linestyle="", label="goal"))
-    cross = {"marker": "X", "color": INK, "linestyle": "", "markeredgecolor": "white", "markersize": 7}
+    cross: dict[str, Any] = {"marker": "X", "color": INK, "linestyle": "", "markeredgecolor": "white", "markersize": 7}
     handles.append(Line2D([], [], **cross, label="collision begins"))
     figure.legend(handles=handles, ncols=len(handles), handlelength=1.5, **LEGEND)
     save_figure(figure, path)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Sequence
+from typing import Any
 
 import numpy as np
 from matplotlib.figure import Figure
@@ -58,8 +59,14 @@ def plot_denoising(
             box = Rectangle((-max_speed, -max_speed), 2 * max_speed, 2 * max_speed, fill=False, edgecolor=SHAPE)
             box.set(linewidth=0.7, linestyle=(0, (3, 2)))
             axes.add_patch(box)
-            axes.scatter(*chain[k, :, i].T, s=4, color=colour, alpha=0.45, linewidths=0, zorder=2)
-            arrow = {"arrowstyle": "-|>", "color": INK, "linewidth": 1.1, "mutation_scale": 7, "shrinkA": 0}
+            axes.scatter(chain[k, :, i, 0], chain[k, :, i, 1], s=4, color=colour, alpha=0.45, linewidths=0, zorder=2)
+            arrow: dict[str, Any] = {
+                "arrowstyle": "-|>",
+                "color": INK,
+                "linewidth": 1.1,
+                "mutation_scale": 7,
+                "shrinkA": 0,
+            }
             axes.annotate("", chain[k, 0, i], (0, 0), arrowprops={**arrow, "shrinkB": 0}, zorder=3)
             axes.set(xlim=(-limit, limit), ylim=(-limit, limit), aspect="equal")
             axes.tick_params(labelsize=7)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Sequence
+from typing import Any
 
 import numpy as np
 from matplotlib.backends.backend_agg import FigureCanvasAgg
@@ -11,6 +12,7 @@ from matplotlib.figure import Figure
 from torch import Tensor
 
 from redig.envs.maps import ObstacleMap
+from redig.envs.occupancy import OccupancyMap
 from redig.files import replacing
 from redig.viz.animation import film_writer
 from redig.viz.canvas import BLOCK, DPI
@@ -27,7 +29,7 @@ def animate_denoising(
     steps: Sequence[int],
     velocity: Tensor,
     position: Tensor,
-    obstacle_map: ObstacleMap,
+    obstacle_map: ObstacleMap | OccupancyMap,
     radius: float = 0.1,
     fps: int = 10,
     hold: float = 2.0,
@@ -77,9 +79,9 @@ def animate_denoising(
     for i, at in enumerate(place[0]):
         colour, _ = robot_style(i)
         dots.append(axes.scatter([], [], s=5, color=colour, alpha=0.5, linewidths=0, zorder=3))
-        arrow = {"arrowstyle": "-|>", "color": colour, "linewidth": 2, "mutation_scale": 11}
-        arrows.append(axes.annotate("", at, at, arrowprops={**arrow, "shrinkA": 0, "shrinkB": 0}, zorder=5))
-        axes.scatter(*at, s=60, color=colour, zorder=5)
+        style: dict[str, Any] = {"arrowstyle": "-|>", "color": colour, "linewidth": 2, "mutation_scale": 11}
+        arrows.append(axes.annotate("", at, at, arrowprops={**style, "shrinkA": 0, "shrinkB": 0}, zorder=5))
+        axes.scatter(at[0], at[1], s=60, color=colour, zorder=5)
     number_robots(axes, place[0], size=6)
     canvas.draw()
     figure.set_layout_engine("none")  # it stays as it is

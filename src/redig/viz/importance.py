@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from redig.envs.maps import ObstacleMap
+from redig.envs.occupancy import OccupancyMap
 from redig.viz.panels import TWO_COLUMNS
 from redig.viz.scene import INK, draw_map, robot_style, save_figure
 from redig.viz.team import number_robots
@@ -29,7 +30,7 @@ def plot_importance(
     importance: Mapping[str, Tensor],
     position: Tensor,
     moments: Sequence[str],
-    obstacle_map: ObstacleMap,
+    obstacle_map: ObstacleMap | OccupancyMap,
     radius: float = 0.1,
 ) -> None:
     """Draw who moves whom: for each policy a row of graphs and a row of tables, a column a moment, on one scale.
@@ -65,9 +66,9 @@ def plot_importance(
     if not importance:
         raise ValueError("importance: got no policy, expected one or more")
     expected = [len(moments), position.shape[1], position.shape[1]]
-    for name, value in importance.items():
-        if list(value.shape) != expected:
-            raise ValueError(f"importance: got shape {list(value.shape)} of {name!r}, expected {expected}")
+    for name, given in importance.items():
+        if list(given.shape) != expected:
+            raise ValueError(f"importance: got shape {list(given.shape)} of {name!r}, expected {expected}")
     place = position.numpy(force=True)
     values = {name: _others_only(value.numpy(force=True)) for name, value in importance.items()}
     scale = Normalize(0, max(float(np.nanmax(value)) for value in values.values()) or 1.0)
@@ -124,7 +125,7 @@ def _draw_graph(axes: Axes, value: NDArray, place: NDArray, radius: float, scale
             )
             axes.add_patch(arrow)
     for i, at in enumerate(place):
-        axes.scatter(*at, s=90, color=robot_style(i)[0], edgecolors="white", linewidths=0.8, zorder=5)
+        axes.scatter(at[0], at[1], s=90, color=robot_style(i)[0], edgecolors="white", linewidths=0.8, zorder=5)
     number_robots(axes, place)
 
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import warnings
 from collections.abc import Mapping
+from typing import Any
 
 import numpy as np
 from matplotlib.ticker import MaxNLocator
@@ -51,7 +52,7 @@ def plot_jerk(path: str | os.PathLike, jerk: Mapping[str, Tensor], dt: float = 0
         time = dt * (np.arange(len(profile)) + 1.5)
         for i, robot in enumerate(profile.T):
             colour, line = robot_style(i)
-            marks = {"marker": MARKERS[i % len(MARKERS)], "markersize": 2.8, "markevery": (2 * i, 10)}
+            marks: dict[str, Any] = {"marker": MARKERS[i % len(MARKERS)], "markersize": 2.8, "markevery": (2 * i, 10)}
             axes.plot(time, robot, color=colour, linestyle=line, linewidth=0.8, label=f"robot {i}", **marks)
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", RuntimeWarning)  # at times, all robots have arrived

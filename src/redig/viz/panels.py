@@ -2,11 +2,19 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 ONE_COLUMN, TWO_COLUMNS = 3.4, 7.0  # widths of a figure in a paper of two columns (inches)
-LEGEND = {"loc": "outside upper center", "frameon": False, "fontsize": 7, "handletextpad": 0.5, "columnspacing": 1.2}
+LEGEND: dict[str, Any] = {
+    "loc": "outside upper center",
+    "frameon": False,
+    "fontsize": 7,
+    "handletextpad": 0.5,
+    "columnspacing": 1.2,
+}
 
 
 def panel_grid(count: int, width: float, least_width: float, ratio: float) -> tuple[Figure, list[Axes]]:
