@@ -43,6 +43,8 @@ class Arguments:
     """Another checkout whose recipe is timed in turn, seed by seed."""
     threads: int = 2
     """Threads of each run."""
+    until_targets: bool = False
+    """Stop each run at the first validation that reaches all targets."""
     options: str = ""
     """Options passed on to the recipe, in one string: --options="--smoke"."""
     runs: Path | None = None
@@ -58,7 +60,8 @@ def main(arguments: Arguments) -> list[dict[str, Any]]:
     for seed in arguments.seeds:
         for name, root in checkouts.items():
             keep = arguments.runs / f"wedge-seed{seed}" if arguments.runs and root == ROOT else None
-            row, curve = timed_run(root, seed, arguments.threads, shlex.split(arguments.options), keep)
+            options = shlex.split(arguments.options)
+            row, curve = timed_run(root, seed, arguments.threads, options, keep, arguments.until_targets)
             rows.append({"recipe": name, "seed": seed, **row})
             curves += [{"recipe": name, "seed": seed, **evaluation} for evaluation in curve]
     targets = ", ".join(f"{name} {'≥' if least else '≤'} {value:g}" for name, (value, least) in TARGETS.items())
@@ -73,7 +76,12 @@ def main(arguments: Arguments) -> list[dict[str, Any]]:
 
 
 def timed_run(
-    root: Path, seed: int, threads: int, options: Sequence[str] = (), keep: Path | None = None
+    root: Path,
+    seed: int,
+    threads: int,
+    options: Sequence[str] = (),
+    keep: Path | None = None,
+    until_targets: bool = False,
 ) -> tuple[dict[str, Any], list[dict[str, Any]]]:
     """One run in a fresh folder: the times and final figures, and all evaluations with their times."""
     folder = Path(tempfile.mkdtemp(prefix="redig-wall-clock-"))
@@ -90,10 +98,14 @@ def timed_run(
                 time.sleep(0.1)
                 for evaluation in evaluations(folder / "run")[len(curve) :]:
                     curve.append({"seconds": time.perf_counter() - started, **evaluation})
+                if until_targets and any(map(reached, curve)):
+                    process.kill()
+                    process.wait()
+        stopped = until_targets and any(map(reached, curve))
         seconds = time.perf_counter() - started
-        if process.returncode:
+        if process.returncode and not stopped:
             raise RuntimeError(f"{' '.join(command)} failed:\n{(folder / 'output.txt').read_text()[-2000:]}")
-        final = json.loads((folder / "run" / "metrics.json").read_text())
+        final = {} if stopped else json.loads((folder / "run" / "metrics.json").read_text())
         if keep is not None:
             shutil.copytree(folder / "run", keep)
     finally:
@@ -101,10 +113,10 @@ def timed_run(
     row = {
         "to 99 % success (s)": next((e["seconds"] for e in curve if e["success_rate"] >= 0.99), "not reached"),
         "to all targets (s)": next((e["seconds"] for e in curve if reached(e)), "not reached"),
-        "whole run (s)": seconds,
-        "final: all targets": reached(final),
+        "whole run (s)": "stopped" if stopped else seconds,
+        "final: all targets": "" if stopped else reached(final),
     }
-    return {**row, **{name: final[name] for name in TARGETS}}, curve
+    return {**row, **{name: final.get(name, "") for name in TARGETS}}, curve
 
 
 def evaluations(run: Path) -> list[dict[str, float]]:

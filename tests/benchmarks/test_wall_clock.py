@@ -36,6 +36,12 @@ def test_times_are_those_of_the_evaluations(checkout):
     assert not row["final: all targets"]  # the travel time of the final evaluation
 
 
+def test_a_run_can_be_stopped_once_all_targets_are_reached(checkout):
+    row, curve = timed_run(checkout, seed=0, threads=1, until_targets=True)
+    assert len(curve) == 3 and row["whole run (s)"] == "stopped"
+    assert row["to all targets (s)"] == curve[-1]["seconds"] and row["success_rate"] == ""
+
+
 def test_a_run_that_fails_says_why(checkout):
     (checkout / "recipes/redig_wedge.py").write_text("raise SystemExit('no corridor')")
     with pytest.raises(RuntimeError, match="no corridor"):
