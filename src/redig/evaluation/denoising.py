@@ -21,8 +21,8 @@ def denoising_path(
         sampler: in place of the actor's own.
 
     Returns:
-        The S steps of the states, counted as in the paper: the first is the noisiest, the last, 0, the action. With
-        them the states ``[S, *B, A]`` (m/s), in the scale of the action's bounds; before the last they may leave them.
+        The S steps of the states, counted as in the paper, so the first is the noisiest, and the last, 0, the action;
+        and the states ``[S, *B, A]`` (m/s), in the scale of the action's bounds; before the last they may leave them.
 
     Examples:
         >>> import torch
