@@ -60,7 +60,7 @@ def test_nodes_command_what_the_policy_of_the_team_does(policy_file, robot_polic
     for node in nodes:
         node.act()
     commands = torch.tensor([[transport.commanded.forward, transport.commanded.left] for transport in transports])
-    torch.testing.assert_close(commands, expected, rtol=0, atol=1e-5)
+    torch.testing.assert_close(commands, expected, rtol=0, atol=5e-5)  # float32 all the way
 
 
 anything = st.one_of(st.floats(), st.none(), st.text(max_size=3), st.integers())

@@ -24,6 +24,18 @@ class EpisodePlanner(TensorDictModuleBase):
 
     Raises:
         ValueError: when called with an observation of another number of robots than the scenario's.
+
+    Examples:
+        >>> from redig.envs import make_env
+        >>> class Resting(EpisodePlanner):
+        ...     def begin(self, teams, position, goal, num_teams):
+        ...         pass
+        ...
+        ...     def command(self, position, velocity, step):
+        ...         return torch.zeros_like(position)
+        >>> env = make_env(2)
+        >>> env.rollout(3, Resting(env.scenario))["agents", "action"].abs().max().item()
+        0.0
     """
 
     def __init__(self, scenario: FormationNavigation) -> None:

@@ -167,5 +167,10 @@ def heading_of(position: Tensor, offsets: Tensor) -> Tensor:
 
 
 def wrapped(angle: Tensor) -> Tensor:
-    """The same angle (rad) between -pi and pi."""
+    """The same angle (rad) between -pi and pi.
+
+    Examples:
+        >>> wrapped(torch.tensor([0.5, 5.5])).round(decimals=4)
+        tensor([ 0.5000, -0.7832])
+    """
     return torch.atan2(angle.sin(), angle.cos())

@@ -115,7 +115,7 @@ def curve(
         >>> left = curve(radius=3.0, turn=1.2).route
         >>> left[:2]  # 1.75 m straight on, down and to the right
         tensor([[-3.1445,  0.0000],
-                [-1.7001, -0.9881]])
+                [-1.7002, -0.9881]])
     """
     _check_positive(gap=gap, radius=radius, approach=approach, piece=piece)
     if not 0 < abs(turn) <= 3:

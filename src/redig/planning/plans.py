@@ -59,6 +59,16 @@ def plan_alone(
 
     Returns:
         a function from positions ``[E, n, 2]`` (m) to commands ``[E, n, 2]`` (m/s).
+
+    Examples:
+        >>> from redig.envs import make_env
+        >>> env = make_env(2, n_robots=3)
+        >>> observation = env.reset()["agents", "observation"]
+        >>> start, goal = observation[..., :2], observation[..., :2] + observation[..., 4:6]
+        >>> speed, generator = (0.5, 1.0), torch.Generator()
+        >>> tracker = plan_alone(env.scenario, start, goal, "astar", speed, generator, 0, lambda team: None)
+        >>> tracker(start).shape
+        torch.Size([2, 3, 2])
     """
     grid_of = lru_cache(maxsize=None)(lambda team_map: planning_grid(team_map, scenario.radius))
     num_envs, n = start.shape[:2]
@@ -84,6 +94,15 @@ def plan_together(
     """Commands of teams that each have one plan, that of a virtual structure, and one speed.
 
     The arguments are those of :func:`plan_alone`. The function returned counts its calls: one for each step.
+
+    Examples:
+        >>> from redig.envs import make_env
+        >>> env = make_env(2, n_robots=3)
+        >>> observation = env.reset()["agents", "observation"]
+        >>> start, goal = observation[..., :2], observation[..., :2] + observation[..., 4:6]
+        >>> tracker = plan_together(env.scenario, start, goal, (1.0, 1.0), torch.Generator(), lambda team: None)
+        >>> tracker(start).shape
+        torch.Size([2, 3, 2])
     """
     structure_of = lru_cache(maxsize=None)(
         lambda team_map: StructurePlanner(

@@ -29,8 +29,7 @@ class StructurePlanner:
     The formation is a structure that moves along a path through the middle of the free room (:func:`centre_path`). Each
     robot keeps its place in it: so far along the path, so far to the left of it. Where the map is too narrow, the
     structure is squeezed: the places ``o_i`` (forward, left) become ``o_i (I + u (D - I))^T`` with
-
-        ``D = [[stretch, shear], [0, squeeze]]``,    u from 0 to 1.
+    ``D = [[stretch, shear], [0, squeeze]]`` and u from 0 to 1.
 
     ``squeeze`` is what fits the narrowest place. ``stretch`` and ``shear`` are chosen such that robots keep apart and
     ``tau - delay_cost * (metres that robots must gain or lose on the centre)`` is largest: each such metre costs about
