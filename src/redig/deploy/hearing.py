@@ -30,7 +30,7 @@ class Hearing:
     Clocks of robots need not agree. How old a message is counts from when it came, by the receiver's clock. The
     sender's stamps tell in which order its messages were sent, and how much longer than the fastest of them one was
     under way: by more than ``timeout``, and it is passed over, as is one from the future. Passed over are also messages
-    of robots not known, those that :meth:`RobotState.check <redig.deploy.RobotState.check>` refuses, robots faster than
+    of robots not known, those that ``RobotState.check`` refuses, robots faster than
     ``fastest``, and robots that leap. One whose last message came more than ``timeout`` ago is forgotten, stamps and
     all: when it is back, even with a clock that was reset, it is heard like a new one.
 

@@ -96,7 +96,7 @@ class RobotPolicy:
             noise: ``[S, 2]``, of the S transitions that the sampler adds noise to; default: drawn. Likewise.
 
         Raises:
-            ValueError: if a state cannot be used (:meth:`RobotState.check <redig.deploy.RobotState.check>`), two are
+            ValueError: if a state cannot be used (``RobotState.check``), two are
                 of the same robot, or latent and noise do not fit the policy.
         """
         states = [own, *neighbours]
