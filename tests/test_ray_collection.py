@@ -4,6 +4,7 @@ import sys
 from functools import partial
 from pathlib import Path
 
+import cloudpickle
 import pytest
 import torch
 from tensordict.nn import TensorDictModule, TensorDictSequential
@@ -47,9 +48,9 @@ def collection(flag=Path("no flag"), **options):
     return RayCollection(ENV, policy, **{**given, **options}), linear
 
 
-def test_a_worker_that_dies_at_any_moment_costs_no_batch(tmp_path):
-    ray = pytest.importorskip("ray", reason="needs ray: pip install 'redig[ray]'")
-    ray.cloudpickle.register_pickle_by_value(sys.modules[__name__])
+def test_a_worker_that_dies_while_it_collects_costs_no_batch(tmp_path):
+    pytest.importorskip("ray", reason="needs ray: pip install 'redig[ray]'")
+    cloudpickle.register_pickle_by_value(sys.modules[__name__])  # workers cannot import this file
     experience, linear = collection(tmp_path / "flag", postproc=MultiStep(3, 0.9, keep=[ACTION, BASE]))
     try:
         data = next(experience)
@@ -60,17 +61,14 @@ def test_a_worker_that_dies_at_any_moment_costs_no_batch(tmp_path):
         nn.init.constant_(linear.bias, 0.2)
         assert (next(experience)[BASE] == 0.2).all()  # the weights have arrived
 
-        ray.kill(experience.collector.remote_collectors[0])  # between batches
+        (tmp_path / "flag").touch()
         nn.init.constant_(linear.bias, 0.3)
-        with pytest.warns(UserWarning, match="lost 1 of 2 workers"):
+        with pytest.warns(UserWarning, match="lost a worker, all are started again: The actor died"):
             again = next(experience)
-        assert again.shape == data.shape and (again[BASE] == 0.3).all() and experience.restarts == 1
-        assert not torch.equal(again[ACTION] - 0.3, data[ACTION] - 0.1)  # no repetition
-
-        (tmp_path / "flag").touch()  # within one
-        with pytest.warns(UserWarning, match="lost 1 of 2 workers"):
-            assert (next(experience)[BASE] == 0.3).all()
-        assert experience.restarts == 2 and not (tmp_path / "flag").exists()
+        assert not (tmp_path / "flag").exists() and experience.restarts == 1
+        assert again.shape == data.shape and (again[BASE] == 0.3).all()
+        assert not torch.allclose(again[ACTION] - 0.3, data[ACTION] - 0.1)  # no repetition
+        assert (next(experience)[BASE] == 0.3).all()
     finally:
         experience.shutdown()
 

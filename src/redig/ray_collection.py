@@ -9,12 +9,16 @@ from __future__ import annotations
 import warnings
 from collections.abc import Callable, Iterator
 from functools import partial
+from typing import TYPE_CHECKING
 
 import torch
 from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModuleBase
 from torchrl.envs import EnvBase
 from torchrl.envs.utils import ExplorationType
+
+if TYPE_CHECKING:
+    from torchrl.collectors.distributed import RayCollector
 
 
 class RayCollection(Iterator[TensorDictBase]):
@@ -69,7 +73,7 @@ class RayCollection(Iterator[TensorDictBase]):
         if not ray.is_initialized():  # here, because RayCollector would end a cluster that it has started itself
             local = {"num_cpus": num_workers, "include_dashboard": False} if address == "local" else {}
             ray.init(address, log_to_driver=False, **local)
-        self._start()
+        self.collector: RayCollector | None = None  # from the first batch on
 
     def __next__(self) -> TensorDictBase:
         """A batch; workers that are lost meanwhile are replaced first."""
@@ -77,23 +81,28 @@ class RayCollection(Iterator[TensorDictBase]):
 
         for attempt in range(self.ATTEMPTS):
             try:
+                if self.collector is None:
+                    self._start()
                 return next(self._batches)
-            except (RayActorError, RuntimeError) as error:  # RuntimeError: weights that could not be sent
-                alive = self.collector.stats()["workers_alive"]
-                if alive == self.collector.num_collectors or attempt + 1 == self.ATTEMPTS:
+            except (RayActorError, RuntimeError) as error:  # RuntimeError: of a worker, or weights could not be sent
+                lost = isinstance(error, RayActorError) or self._unanswered()
+                if not lost or attempt + 1 == self.ATTEMPTS:
                     raise
-                lost = self.collector.num_collectors - alive
-                warnings.warn(
-                    f"lost {lost} of {self.collector.num_collectors} workers ({error}); restarting", stacklevel=2
-                )
+                warnings.warn(f"lost a worker, all are started again: {error}", stacklevel=2)
                 self.shutdown()
                 self.restarts += 1
-                self._start()
         raise AssertionError("unreachable")
 
     def shutdown(self) -> None:
         """Stop the workers; the connection to the cluster stays."""
-        self.collector.shutdown()
+        if self.collector is not None:
+            self.collector.shutdown()
+            self.collector = None
+
+    def _unanswered(self) -> int:
+        if self.collector is None:  # its start has failed
+            return 0
+        return self.collector.num_collectors - self.collector.stats()["workers_alive"]
 
     def _start(self) -> None:
         import ray
@@ -118,6 +127,7 @@ class RayCollection(Iterator[TensorDictBase]):
             collector_kwargs=[{"auto_register_policy_transforms": False} for _ in makers],
             remote_configs={"num_cpus": 1},
         )
+        self.collector.update_policy_weights_()  # connects; after that, before each batch
         self._batches = iter(self.collector)
 
 

@@ -21,7 +21,7 @@ def test_a_run_that_loses_a_worker_midway_trains_to_its_end(tmp_path, monkeypatc
 
     monkeypatch.setattr(RayCollection, "__next__", collect_and_lose)
     address = os.environ.get("RAY_ADDRESS", "local")
-    with pytest.warns(UserWarning, match="lost 1 of 2 workers"):
+    with pytest.warns(UserWarning, match="lost a worker, all are started again: The actor died"):
         redig_wedge.train(Config(smoke=True, out=tmp_path / "run", threads=1, ray=address))
     assert [tuple(batch.shape) for batch in batches] == [(2, 4, 20)] * 3
     saved = load_checkpoint(tmp_path / "run" / "checkpoint.pt")
