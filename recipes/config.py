@@ -245,6 +245,12 @@ class Config(Task):
     best_of_n: int = 1
     """Collect with the best of N sampled actions by min Q; 1: off. Evaluations are of the policy itself."""
 
+    # several machines
+    ray: str | None = None
+    """Collect on the Ray cluster at this address (HOST:PORT or auto), or on a new one on this machine (local)."""
+    ray_workers: int = 2
+    """Workers there, of one CPU each, which share num_envs equally."""
+
     def randomisation(self) -> dict[str, Any]:
         """Arguments of :func:`redig.envs.make_env` for the teams that train, beside those of the scenario."""
         scaled = tuple(self.acceleration_range) != (1, 1)
@@ -268,13 +274,17 @@ class Config(Task):
         config.check_positive(
             "num_trajectories", "clone_updates", "clone_batch", "num_envs", "collect_steps", "updates_per_step",
             "batch_size", "buffer_size", "evaluation_interval", "evaluation_starts", "num_starts", "hidden",
-            "best_of_n",
+            "best_of_n", "ray_workers",
         )  # fmt: skip
         round_updates = config.collect_steps * config.updates_per_step
         if config.block < 1 or round_updates % config.block:
             raise ValueError(
                 f"block: got {config.block}, must divide collect_steps * updates_per_step = {round_updates} updates"
             )
+        if config.ray is not None and config.num_envs % config.ray_workers:
+            raise ValueError(f"ray_workers: got {config.ray_workers}, must divide num_envs = {config.num_envs}")
+        if config.ray is not None and config.best_of_n > 1:
+            raise ValueError("best_of_n: with ray it must be 1, the critics do not travel to the workers")
         for name in ("demonstration_share", "final_share"):
             if not 0 <= getattr(config, name) <= 1:
                 raise ValueError(f"{name}: got {getattr(config, name)}, must be in [0, 1]")

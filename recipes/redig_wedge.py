@@ -1,7 +1,8 @@
 """ReDiG (Algorithm 1): demonstrations, cloning, online training and evaluation of a team that crosses a corridor.
 
 Run ``python recipes/redig_wedge.py``; everything goes into one folder under ``runs/``. ``--formation line`` or
-``circle`` trains the other formations, ``--help`` explains each option.
+``circle`` trains the other formations (as ``redig_line.py`` and ``redig_circle.py`` do), ``--ray ADDRESS`` collects on
+a Ray cluster, ``--help`` explains each option.
 """
 
 from __future__ import annotations
@@ -19,6 +20,7 @@ from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModule, TensorDictSequential
 from torchrl.collectors import Collector
 from torchrl.data import LazyTensorStorage, TensorDictReplayBuffer
+from torchrl.envs import EnvBase
 from torchrl.envs.utils import ExplorationType
 from torchrl.modules import AdditiveGaussianModule
 from torchrl.objectives import SoftUpdate
@@ -31,6 +33,7 @@ from redig.modules import BestOfN, QNetwork
 from redig.objectives import DIPOLoss, MultiStep
 from redig.planning import demonstrations
 from redig.policy import ACTION, EMBEDDING, OBSERVATION, PolicyConfig, build_encoder, build_policy, save_policy
+from redig.ray_collection import RayCollection
 
 ARRIVED = ("agents", "info", "arrived")
 BASE_ACTION = ("agents", "policy_action")  # the policy's action before exploration noise
@@ -71,18 +74,11 @@ def train(config: Config) -> dict[str, float]:
     buffer = TensorDictReplayBuffer(storage=storage)
 
     env.set_seed(config.seed)  # VMAS has one random state for all environments: seed after the last is built
-    noise = AdditiveGaussianModule(env.action_spec, config.warmup_noise, config.warmup_noise, action_key=ACTION)
+    bounds = env.full_action_spec_unbatched[ACTION]  # of one team: workers may drive other numbers of them
+    noise = AdditiveGaussianModule(bounds, config.warmup_noise, config.warmup_noise, action_key=ACTION)
     keep_base = TensorDictModule(torch.clone, in_keys=[ACTION], out_keys=[BASE_ACTION])
     behaviour = BestOfN(policy, loss.value, config.best_of_n) if config.best_of_n > 1 else policy
-    collector = Collector(
-        env,
-        TensorDictSequential(behaviour, keep_base, noise),
-        frames_per_batch=config.num_envs * config.collect_steps,
-        total_frames=-1,
-        postproc=multi_step,
-        exploration_type=ExplorationType.RANDOM,
-        auto_register_policy_transforms=False,
-    )
+    collector = make_collector(config, env, TensorDictSequential(behaviour, keep_base, noise), multi_step, run)
     experience = iter(collector)
 
     def batch(updates: int, share: float) -> TensorDictBase:
@@ -112,9 +108,10 @@ def train(config: Config) -> dict[str, float]:
             save_policy(folder / f"{name}.safetensors", policy, policy_config, scenario)
 
     run.track(loss=loss, actor_optimizer=actor_optimizer, critic_optimizer=critic_optimizer, buffer=buffer)
-    run.track_state(
-        "collection", partial(collection_state, env, collector), partial(set_collection_state, env, collector)
-    )
+    if isinstance(collector, Collector):  # the state of Ray's workers stays with them
+        run.track_state(
+            "collection", partial(collection_state, env, collector), partial(set_collection_state, env, collector)
+        )
     run.restore()
 
     # Clone the demonstrations, so that online training starts from a policy that reaches most goals
@@ -160,6 +157,32 @@ def train(config: Config) -> dict[str, float]:
 
     # Line 15: return the policy
     return finish(run, config)
+
+
+def make_collector(
+    config: Config, env: EnvBase, policy: TensorDictSequential, multi_step: MultiStep, run: Run
+) -> Collector | RayCollection:
+    """What collects n-step transitions: this process, or workers on a Ray cluster."""
+    if config.ray is not None:
+        return RayCollection(
+            partial(make_env, reward_scale=config.reward_scale, **config.scenario()),
+            policy,
+            num_envs=config.num_envs,
+            num_steps=config.collect_steps,
+            num_workers=config.ray_workers,
+            address=config.ray,
+            seed=config.seed + sum(run.counters.values()),  # a run that goes on meets other starts
+            postproc=multi_step,
+        )
+    return Collector(
+        env,
+        policy,
+        frames_per_batch=config.num_envs * config.collect_steps,
+        total_frames=-1,
+        postproc=multi_step,
+        exploration_type=ExplorationType.RANDOM,
+        auto_register_policy_transforms=False,
+    )
 
 
 def transitions(data: TensorDictBase, demonstration: bool = False) -> TensorDictBase:

@@ -1,14 +1,16 @@
 """Table 1: every method on every formation, trained, evaluated and written down by one command.
 
 Run ``python recipes/table1.py``. Runs that are finished are kept, interrupted ones continue; ``--only redig:wedge``
-trains a part, ``--train`` nothing at all, ``--help`` explains each option.
+does a part, ``--no-train`` trains nothing, ``--help`` explains each option.
 """
 
 from __future__ import annotations
 
 import csv
+import fcntl
 import json
 import os
+import shlex
 import signal
 import subprocess
 import sys
@@ -17,6 +19,7 @@ import time
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import torch
 import tyro
@@ -25,6 +28,7 @@ from table1_methods import METHODS, Job, jobs, load
 from table1_report import write_report
 from tqdm import tqdm
 
+from redig.envs import FORMATIONS
 from redig.envs.factory import make_env
 from redig.evaluation import evaluate_teams
 from redig.files import replacing
@@ -56,28 +60,60 @@ class Arguments:
 
 
 def main(arguments: Arguments) -> int:
-    """Do what is missing and write the table; returns the number of runs that failed."""
-    wanted = [job for job in jobs(arguments.formations, arguments.seeds, arguments.runs) if job.matches(arguments.only)]
-    if not wanted:
-        raise ValueError(f"only: got {' '.join(arguments.only)}, allowed are {', '.join(METHODS)}, :FORMATION, :SEED")
-    failed = train_all([job for job in wanted if job.command], arguments) if arguments.train else []
+    """Do what is missing and write the table; returns 1 if a run failed, else 0."""
+    check(arguments)
+    everything = jobs(arguments.formations, arguments.seeds, arguments.runs)
+    for part in arguments.only:
+        if not any(job.matches([part]) for job in everything):
+            raise ValueError(
+                f"only: got {part}, must be METHOD, METHOD:FORMATION or METHOD:FORMATION:SEED (no seed where nothing "
+                f"is trained) with a method of {', '.join(METHODS)} and one of the formations and seeds asked for"
+            )
+    wanted = [job for job in everything if job.matches(arguments.only)]
+    failed = train_all([job for job in wanted if job.command], arguments) if arguments.train else {}
     torch.set_num_threads(1)
     for job in tqdm(wanted, desc="evaluate", unit="run", disable=None):
-        if job.ready():
-            evaluate_job(job, arguments.starts)
-    everything = jobs(arguments.formations, arguments.seeds, arguments.runs)
-    print(write_report(arguments.out, [job for job in everything if (job.folder / job.starts_file).exists()]))
-    for job in failed:
-        print(f"failed: {job.name}, see {job.folder / 'output.txt'}", file=sys.stderr)
-    return len(failed)
+        try:
+            if job.ready():
+                evaluate_job(job, arguments)
+            elif job not in failed:
+                print(f"not trained yet: {job.name}, {job.folder} has no metrics.json or no policy", file=sys.stderr)
+        except (OSError, ValueError) as error:
+            failed[job] = str(error)
+    print(write_report(arguments.out, [job for job in everything if job.starts_file.exists()], command(arguments)))
+    for job, reason in failed.items():
+        print(f"failed: {job.name}, {reason}", file=sys.stderr)
+    return 1 if failed else 0
 
 
-def train_all(wanted: list[Job], arguments: Arguments) -> list[Job]:
-    """Train what is not finished, several runs side by side; returns those that failed.
+def check(arguments: Arguments) -> None:
+    """Raise a ValueError for an option out of its range."""
+    for name, allowed in (("seeds", "at least one seed"), ("formations", f"of {', '.join(FORMATIONS)}")):
+        values = getattr(arguments, name)
+        unknown = set(values) - set(FORMATIONS) if name == "formations" else None
+        if not values or len(set(values)) < len(values) or unknown:
+            raise ValueError(f"{name}: got {' '.join(map(str, values)) or 'nothing'}, must be {allowed}, each once")
+    for name in ("parallel", "starts"):
+        if getattr(arguments, name) < 1:
+            raise ValueError(f"{name}: got {getattr(arguments, name)}, must be at least 1")
+
+
+def command(arguments: Arguments) -> str:
+    """The command that makes the whole table from nothing."""
+    default, words = Arguments(), ["python", "recipes/table1.py"]
+    for name in ("seeds", "formations"):
+        if (values := getattr(arguments, name)) != getattr(default, name):
+            words += [f"--{name}", *map(str, values)]
+    words += [] if arguments.starts == default.starts else ["--starts", str(arguments.starts)]
+    return shlex.join(words + [f"--options={arguments.options}"] * bool(arguments.options))
+
+
+def train_all(wanted: list[Job], arguments: Arguments) -> dict[Job, str]:
+    """Train what is not finished, several runs side by side; returns those that failed, and why.
 
     On Ctrl-C or SIGTERM the runs are told to stop; each writes a checkpoint, from which the next call goes on.
     """
-    missing = [job for job in wanted if not job.finished()]
+    missing = [job for job in wanted if not job.ready()]
     running: set[subprocess.Popen] = set()
     stop = threading.Event()
 
@@ -86,12 +122,18 @@ def train_all(wanted: list[Job], arguments: Arguments) -> list[Job]:
         for process in list(running):
             process.send_signal(signal.SIGTERM)
 
-    def train(job: Job) -> bool:
+    def train(job: Job) -> str | None:
         if stop.is_set():
-            return True
+            return None
         job.folder.mkdir(parents=True, exist_ok=True)
         started = time.perf_counter()
         with open(job.folder / "output.txt", "a") as output:
+            try:  # the recipe inherits the lock: it is held while it runs, even if this process is killed
+                fcntl.flock(output, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            except BlockingIOError:
+                return f"another process is training it in {job.folder}"
+            if job.ready():  # one that has just ended
+                return None
             process = subprocess.Popen(
                 [sys.executable, *job.arguments(arguments.options)],
                 stdout=output,
@@ -99,11 +141,13 @@ def train_all(wanted: list[Job], arguments: Arguments) -> list[Job]:
                 start_new_session=True,  # Ctrl-C reaches it through ``interrupt`` only, and once
             )
             running.add(process)
+            if stop.is_set():  # between the question above and here
+                process.send_signal(signal.SIGTERM)
             code = process.wait()
             running.discard(process)
         job.add_seconds(time.perf_counter() - started)
         progress.update()
-        return code == 0
+        return None if code == 0 else f"see {job.folder / 'output.txt'}"
 
     previous = {number: signal.signal(number, interrupt) for number in (signal.SIGINT, signal.SIGTERM)}
     try:
@@ -111,24 +155,21 @@ def train_all(wanted: list[Job], arguments: Arguments) -> list[Job]:
             tqdm(total=len(missing), desc="train", unit="run", disable=None) as progress,
             ThreadPoolExecutor(arguments.parallel) as pool,
         ):
-            succeeded = list(pool.map(train, missing))
+            reasons = list(pool.map(train, missing))
     finally:
         for number, handler in previous.items():
             signal.signal(number, handler)
     if stop.is_set():
         raise SystemExit("stopped; the same command goes on from here")
-    return [job for job, good in zip(missing, succeeded, strict=True) if not good]
+    return {job: reason for job, reason in zip(missing, reasons, strict=True) if reason is not None}
 
 
-def evaluate_job(job: Job, num_starts: int) -> None:
-    """Metrics of each start, as CSV in the folder of the run; kept if they are there and newer than the policy."""
-    path = job.folder / job.starts_file
-    if path.exists() and (job.policy is None or path.stat().st_mtime >= job.policy.stat().st_mtime):
-        with open(path) as file:
-            if sum(1 for _ in file) == num_starts + 1:
-                return
-    scenario = job.scenario()
-    env = make_env(num_starts, **scenario)
+def evaluate_job(job: Job, arguments: Arguments) -> None:
+    """Metrics of each start, as CSV in the folder of the run, and the scenario; kept if they are those asked for."""
+    scenario, path = job.scenario(arguments.options), job.starts_file
+    if up_to_date(job, scenario, arguments.starts):
+        return
+    env = make_env(arguments.starts, **scenario)
     metrics = {key: value.tolist() for key, value in evaluate_teams(load(job, env), env, TEST_SEED).items()}
     with replacing(path) as unfinished, open(unfinished, "w", newline="") as file:
         writer = csv.writer(file)
@@ -136,6 +177,17 @@ def evaluate_job(job: Job, num_starts: int) -> None:
         writer.writerows(zip(*metrics.values(), strict=True))
     with replacing(job.folder / "scenario.json") as unfinished:
         unfinished.write_text(json.dumps(scenario, indent=2) + "\n")
+
+
+def up_to_date(job: Job, scenario: dict[str, Any], num_starts: int) -> bool:
+    """Whether a run is evaluated in this scenario, on this number of starts, after its policy was written."""
+    path, saved = job.starts_file, job.folder / "scenario.json"
+    if not path.exists() or not saved.exists() or json.loads(saved.read_text()) != json.loads(json.dumps(scenario)):
+        return False
+    if job.policy is not None and path.stat().st_mtime < job.policy.stat().st_mtime:
+        return False
+    with open(path) as file:
+        return sum(1 for _ in file) == num_starts + 1
 
 
 if __name__ == "__main__":

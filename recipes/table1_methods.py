@@ -7,8 +7,11 @@ import shlex
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
+import tyro
 from classic import METHODS as PLANNERS
+from config import Config
 from tensordict.nn import TensorDictModuleBase
 from torchrl.envs import EnvBase
 
@@ -101,22 +104,18 @@ class Job:
         return None if self.method in PLANNERS else self.folder / METHODS[self.method].file
 
     @property
-    def starts_file(self) -> str:
-        """Name of the CSV file with the metrics of each start."""
-        return f"starts-{Path(METHODS[self.method].file).stem}.csv"
+    def starts_file(self) -> Path:
+        """The CSV file with the metrics of each start."""
+        return self.folder / f"starts-{Path(METHODS[self.method].file).stem}.csv"
 
     def matches(self, only: Sequence[str]) -> bool:
         """Whether one of METHOD, METHOD:FORMATION, METHOD:FORMATION:SEED names it, or nothing is asked for."""
         parts = self.name.split(":")
         return not only or any(parts[: len(wanted.split(":"))] == wanted.split(":") for wanted in only)
 
-    def finished(self) -> bool:
-        """Whether its training has ended."""
-        return (self.folder / "metrics.json").exists()
-
     def ready(self) -> bool:
-        """Whether it can be evaluated."""
-        return self.policy is None or (self.finished() and self.policy.exists())
+        """Whether it can be evaluated: its training has ended and left a policy, or it needs neither."""
+        return self.policy is None or ((self.folder / "metrics.json").exists() and self.policy.exists())
 
     def arguments(self, options: str) -> list[str]:
         """The command line that trains it, from the start or from its checkpoint."""
@@ -133,19 +132,25 @@ class Job:
     def seconds(self) -> float:
         """Wall clock of its training (s)."""
         path = self.folder / "seconds.json"
-        return json.loads(path.read_text()) if path.exists() else 0.0
+        return json.loads(path.read_text()) if self.command and path.exists() else 0.0
 
     def frames(self) -> int:
         """Steps of single teams that its training collected, without demonstrations."""
         path = self.folder / "config.json"
-        if not path.exists() or METHODS[self.method].recipe is None:
+        if not self.command or not path.exists():
             return 0
         config = json.loads(path.read_text())
         return config.get("frames") or config["num_envs"] * (config["warmup_steps"] + config["env_steps"])
 
-    def scenario(self) -> dict:
-        """Arguments of the scenario that it is evaluated in."""
-        return {"formation": self.formation} if self.policy is None else read_header(self.policy)[1]
+    def scenario(self, options: str) -> dict[str, Any]:
+        """Arguments of the scenario that it is evaluated in: what it was trained in, or options of the recipes say."""
+        if self.policy is None:
+            config = tyro.cli(Config, args=["--formation", self.formation, *shlex.split(options)])
+            return config.resolve().scenario("evaluation")
+        scenario = read_header(self.policy)[1]
+        if scenario.get("obstacle_map", "").endswith(":train"):
+            scenario["obstacle_map"] = scenario["obstacle_map"].replace(":train", ":evaluation")
+        return scenario
 
 
 def jobs(formations: Sequence[str], seeds: Sequence[int], runs: Path) -> list[Job]:

@@ -8,6 +8,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
+from finish import TEST_SEED
 from table1_methods import METHODS, Job
 
 from redig.files import replacing
@@ -24,6 +25,7 @@ COLUMNS = {  # metric: head of the column, factor, digits
     "cfi_literal_0.03": ("literal 0.03", 100, 1),
     "jerk_mean": ("jerk (m/s³)", 1, 2),
 }
+ARRIVING = 0.95  # of the robots, for a travel time to count
 PAPER = {  # SR (%), TT (s), CFI (%) at 0.5, 0.1 and 0.03: the paper's Table 1
     "leader_follower": {
         "circle": (60.00, 15.80, 75.11, 70.10, 66.04),
@@ -48,9 +50,9 @@ PAPER = {  # SR (%), TT (s), CFI (%) at 0.5, 0.1 and 0.03: the paper's Table 1
 }
 
 
-def write_report(out: Path, done: Sequence[Job]) -> str:
-    """Write ``seeds.csv``, one row a run, and ``table.md``; returns the table."""
-    starts = {job: read_starts(job.folder / job.starts_file) for job in done}
+def write_report(out: Path, done: Sequence[Job], command: str) -> str:
+    """Write ``seeds.csv``, one row a run, and ``table.md`` with the command that made it; returns the table."""
+    starts = {job: read_starts(job.starts_file) for job in done}
     rows: list[dict[str, str | float]] = []
     for job, metrics in starts.items():
         run = {"method": job.method, "formation": job.formation, "seed": "" if job.seed is None else str(job.seed)}
@@ -60,24 +62,52 @@ def write_report(out: Path, done: Sequence[Job]) -> str:
         writer = csv.DictWriter(file, list(rows[0]) if rows else [])
         writer.writeheader()
         writer.writerows(rows)
-    table = "\n".join(formation_table(formation, starts) for formation in dict.fromkeys(job.formation for job in done))
+    formations = dict.fromkeys(job.formation for job in done)
+    table = "\n".join([head(command, starts), *(formation_table(formation, starts) for formation in formations)])
     with replacing(out / "table.md") as file:
         file.write_text(table)
     return table
 
 
+def head(command: str, starts: dict[Job, dict[str, np.ndarray]]) -> str:
+    """What made the table, and how to read it."""
+    seeds = ", ".join(map(str, sorted({job.seed for job in starts if job.seed is not None}))) or "none"
+    counts = ", ".join(map(str, sorted({len(metrics["success_rate"]) for metrics in starts.values()}))) or "no"
+    return (
+        f"`{command}`\n\nTraining seeds {seeds}; {counts} starts (seed {TEST_SEED:,}) that training never saw, the "
+        "same for all. Mean and, in brackets, its 95 % interval (bootstrap over seeds, then starts). TT of teams that "
+        f"arrive whole. Bold: the shortest of the methods of which {ARRIVING:.0%} of robots arrive. Grey: the paper.\n"
+    )
+
+
+def fastest(runs: dict[str, dict[Job, dict[str, np.ndarray]]]) -> str | None:
+    """The method with the shortest travel time of those of which enough robots arrive."""
+    times = {}
+    for method, metrics in runs.items():
+        rate, time = (
+            nanmean(np.concatenate([run[name] for run in metrics.values()])) for name in ("success_rate", "travel_time")
+        )
+        if rate >= ARRIVING and not math.isnan(time):
+            times[method] = time
+    return min(times, key=times.__getitem__, default=None)
+
+
 def formation_table(formation: str, starts: dict[Job, dict[str, np.ndarray]]) -> str:
     """The rows of one formation."""
+    found: dict[str, dict[Job, dict[str, np.ndarray]]] = {}
+    for job, metrics in starts.items():
+        if job.formation == formation:
+            found.setdefault(job.method, {})[job] = metrics
+    best = fastest(found)
     heads = ["", "seeds", *(head for head, _, _ in COLUMNS.values()), "frames", "minutes"]
     lines = [f"### {formation.capitalize()}", "", f"| {' | '.join(heads)} |", "|" + "---|" * len(heads)]
     for method, what in METHODS.items():
-        runs = {job: metrics for job, metrics in starts.items() if (job.method, job.formation) == (method, formation)}
-        if not runs:
+        if (runs := found.get(method)) is None:
             continue
-        cells = [
-            cell([metrics[name] for metrics in runs.values()], factor, digits)
-            for name, (_, factor, digits) in COLUMNS.items()
-        ]
+        cells = []
+        for name, (_, factor, digits) in COLUMNS.items():
+            text = cell([metrics[name] for metrics in runs.values()], factor, digits)
+            cells.append(f"**{text}**" if (method, name) == (best, "travel_time") else text)
         frames = max(job.frames() for job in runs)
         minutes = [job.seconds() / 60 for job in runs if job.seconds()]
         cost = [f"{frames:,}" if frames else "", f"{np.mean(minutes):.1f}" if minutes else ""]
@@ -106,14 +136,16 @@ def bootstrap(runs: Sequence[np.ndarray], resamples: int = 2000, seed: int = 0) 
     that of the starts alone. NaN, where a start has no such metric, is left out.
     """
     rng = np.random.default_rng(seed)
-    means = np.full(resamples, np.nan)
-    for i in range(resamples):
-        chosen = [runs[k] for k in rng.integers(len(runs), size=len(runs))]
-        means[i] = nanmean(np.concatenate([values[rng.integers(len(values), size=len(values))] for values in chosen]))
-    mean = nanmean(np.concatenate(list(runs)))
-    if np.isnan(means).all():
+    chosen = rng.integers(len(runs), size=(resamples, len(runs)))
+    total, count = np.zeros(chosen.shape), np.zeros(chosen.shape)
+    for k, values in enumerate(runs):
+        where = chosen == k
+        drawn = values[rng.integers(len(values), size=(where.sum(), len(values)))]
+        total[where], count[where] = np.nansum(drawn, axis=1), (~np.isnan(drawn)).sum(1)
+    mean, measured = nanmean(np.concatenate(list(runs))), count.sum(1) > 0
+    if not measured.any():
         return mean, math.nan, math.nan
-    low, high = np.nanpercentile(means, [2.5, 97.5])
+    low, high = np.percentile(total.sum(1)[measured] / count.sum(1)[measured], [2.5, 97.5])
     return mean, float(low), float(high)
 
 

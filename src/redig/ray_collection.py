@@ -1,0 +1,138 @@
+"""Collection on a Ray cluster that goes on when it loses workers.
+
+TorchRL's ``RayCollector`` does not: its iterator ends with Ray's ``ActorDiedError`` and cannot be entered again, and
+the process group through which it sends weights has a fixed number of members, which a restarted worker cannot join.
+"""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Callable, Iterator
+from functools import partial
+from typing import TYPE_CHECKING
+
+import torch
+from tensordict import TensorDictBase
+from tensordict.nn import TensorDictModuleBase
+from torchrl.envs import EnvBase
+from torchrl.envs.utils import ExplorationType
+
+if TYPE_CHECKING:
+    from torchrl.collectors.distributed import RayCollector
+
+
+class RayCollection(Iterator[TensorDictBase]):
+    """An endless iterator over batches ``[workers, envs of a worker, num_steps]`` of experience.
+
+    A batch is collected with the weights (and buffers) that the policy has when it is asked for. If workers are lost,
+    the batch is thrown away, all workers are started again, with other seeds and in new episodes, and the batch is
+    collected anew: there are fewer workers then if the cluster has fewer CPUs left. Policy, optimiser and replay buffer
+    are the caller's, so nothing that was learned is lost.
+
+    Args:
+        env_maker: makes a vectorised environment from ``num_envs`` and ``seed``; workers unpickle it, so whatever it
+            refers to must be installed on their machines.
+        policy: acts in the workers; it has parameters.
+        num_envs: environments of all workers together.
+        num_steps: of each environment in a batch.
+        num_workers: workers, one CPU each; they share ``num_envs`` equally.
+        address: of a running cluster, as ``ray.init`` takes it (``HOST:PORT``, ``auto``), or ``local`` for a new one on
+            this machine.
+        seed: of environments and random actions, other for each worker.
+        postproc: applied here to each batch, for example :class:`~redig.objectives.MultiStep`.
+
+    Raises:
+        ImportError: if Ray is missing; the message names the extra to install.
+        ValueError: if ``num_workers`` is less than 1 or does not divide ``num_envs``.
+        ConnectionError: from Ray, if there is no cluster at the address.
+    """
+
+    ATTEMPTS = 3  # without a batch in between, before a loss of workers is an error
+
+    def __init__(
+        self,
+        env_maker: Callable[..., EnvBase],
+        policy: TensorDictModuleBase,
+        *,
+        num_envs: int,
+        num_steps: int,
+        num_workers: int,
+        address: str,
+        seed: int,
+        postproc: Callable[[TensorDictBase], TensorDictBase] | None = None,
+    ) -> None:
+        if num_workers < 1 or num_envs % num_workers:
+            raise ValueError(f"num_workers: got {num_workers}, must be at least 1 and divide num_envs = {num_envs}")
+        try:
+            import ray
+        except ImportError as error:
+            raise ImportError("collection on a cluster needs ray; install it with: pip install 'redig[ray]'") from error
+        self.env_maker, self.policy, self.postproc = env_maker, policy, postproc
+        self.num_envs, self.num_steps, self.num_workers, self.seed = num_envs, num_steps, num_workers, seed
+        self.restarts = 0
+        if not ray.is_initialized():  # here, because RayCollector would end a cluster that it has started itself
+            local = {"num_cpus": num_workers, "include_dashboard": False} if address == "local" else {}
+            ray.init(address, log_to_driver=False, **local)
+        self.collector: RayCollector | None = None  # from the first batch on
+
+    def __next__(self) -> TensorDictBase:
+        """A batch; workers that are lost meanwhile are replaced first."""
+        from ray.exceptions import RayActorError
+
+        for attempt in range(self.ATTEMPTS):
+            try:
+                if self.collector is None:
+                    self._start()
+                return next(self._batches)
+            except (RayActorError, RuntimeError) as error:  # RuntimeError: of a worker, or weights could not be sent
+                lost = isinstance(error, RayActorError) or self._unanswered()
+                if not lost or attempt + 1 == self.ATTEMPTS:
+                    raise
+                warnings.warn(f"lost a worker, all are started again: {error}", stacklevel=2)
+                self.shutdown()
+                self.restarts += 1
+        raise AssertionError("unreachable")
+
+    def shutdown(self) -> None:
+        """Stop the workers; the connection to the cluster stays."""
+        if self.collector is not None:
+            self.collector.shutdown()
+            self.collector = None
+
+    def _unanswered(self) -> int:
+        if self.collector is None:  # its start has failed
+            return 0
+        return self.collector.num_collectors - self.collector.stats()["workers_alive"]
+
+    def _start(self) -> None:
+        import ray
+        from torchrl.collectors.distributed import RayCollector
+
+        cpus = int(ray.cluster_resources().get("CPU", 0))
+        workers = max(w for w in range(1, self.num_workers + 1) if self.num_envs % w == 0 and w <= max(cpus, 1))
+        # a seed for each worker of each start, from a sequence of their own
+        seeds = torch.randint(
+            2**31, (workers,), generator=torch.Generator().manual_seed(self.seed + 10_007 * self.restarts)
+        )
+        makers = [partial(_seeded, self.env_maker, self.num_envs // workers, int(seed)) for seed in seeds]
+        self.collector = RayCollector(
+            makers,
+            self.policy,
+            frames_per_batch=self.num_envs * self.num_steps,
+            total_frames=2**62,  # -1, which means endless elsewhere, yields nothing
+            sync=True,
+            update_after_each_batch=True,
+            postproc=self.postproc,
+            exploration_type=ExplorationType.RANDOM,
+            collector_kwargs=[{"auto_register_policy_transforms": False} for _ in makers],
+            remote_configs={"num_cpus": 1},
+        )
+        self.collector.update_policy_weights_()  # connects; after that, before each batch
+        self._batches = iter(self.collector)
+
+
+def _seeded(env_maker: Callable[..., EnvBase], num_envs: int, seed: int) -> EnvBase:
+    """The environment of a worker, whose random actions are seeded too: else all workers draw the same."""
+    torch.set_num_threads(1)
+    torch.manual_seed(seed)
+    return env_maker(num_envs=num_envs, seed=seed)
