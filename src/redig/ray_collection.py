@@ -9,7 +9,7 @@ from __future__ import annotations
 import warnings
 from collections.abc import Callable, Iterator
 from functools import partial
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import torch
 from tensordict import TensorDictBase
@@ -71,7 +71,7 @@ class RayCollection(Iterator[TensorDictBase]):
         self.num_envs, self.num_steps, self.num_workers, self.seed = num_envs, num_steps, num_workers, seed
         self.restarts = 0
         if not ray.is_initialized():  # here, because RayCollector would end a cluster that it has started itself
-            local = {"num_cpus": num_workers, "include_dashboard": False} if address == "local" else {}
+            local: dict[str, Any] = {"num_cpus": num_workers, "include_dashboard": False} if address == "local" else {}
             ray.init(address, log_to_driver=False, **local)
         self.collector: RayCollector | None = None  # from the first batch on
 
