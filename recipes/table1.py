@@ -76,7 +76,7 @@ def main(arguments: Arguments) -> int:
         try:
             if job.ready():
                 evaluate_job(job, arguments)
-            elif job not in failed:
+            elif not job.starts_file.exists() and job not in failed:
                 print(f"not trained yet: {job.name}, {job.folder} has no metrics.json or no policy", file=sys.stderr)
         except (OSError, ValueError) as error:
             failed[job] = str(error)
@@ -111,9 +111,11 @@ def command(arguments: Arguments) -> str:
 def train_all(wanted: list[Job], arguments: Arguments) -> dict[Job, str]:
     """Train what is not finished, several runs side by side; returns those that failed, and why.
 
+    A run of which only the results were kept, without its policy, counts as finished.
+
     On Ctrl-C or SIGTERM the runs are told to stop; each writes a checkpoint, from which the next call goes on.
     """
-    missing = [job for job in wanted if not job.ready()]
+    missing = [job for job in wanted if not job.ready() and not job.starts_file.exists()]
     running: set[subprocess.Popen] = set()
     stop = threading.Event()
 
