@@ -15,6 +15,10 @@ from redig.envs import make_env
 from redig.objectives import MultiStep
 from redig.ray_collection import RayCollection
 
+pytestmark = pytest.mark.skipif(
+    "REDIG_TEST_RAY" not in os.environ, reason="starts a Ray cluster, which takes minutes; set REDIG_TEST_RAY=1"
+)
+
 OBSERVATION, ACTION, BASE = ("agents", "observation"), ("agents", "action"), ("agents", "policy_action")
 ENV = partial(make_env, formation="line", n_robots=3)
 

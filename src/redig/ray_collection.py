@@ -45,6 +45,13 @@ class RayCollection(Iterator[TensorDictBase]):
         ImportError: if Ray is missing; the message names the extra to install.
         ValueError: if ``num_workers`` is less than 1 or does not divide ``num_envs``.
         ConnectionError: from Ray, if there is no cluster at the address.
+
+    Examples:
+        >>> from redig.envs import make_env
+        >>> RayCollection(make_env, None, num_envs=8, num_steps=5, num_workers=3, address="local", seed=0)
+        Traceback (most recent call last):
+        ...
+        ValueError: num_workers: got 3, must be at least 1 and divide num_envs = 8
     """
 
     ATTEMPTS = 3  # without a batch in between, before a loss of workers is an error

@@ -7,6 +7,10 @@ from config import Config
 from redig.checkpoint import load_checkpoint
 from redig.ray_collection import RayCollection
 
+pytestmark = pytest.mark.skipif(
+    "REDIG_TEST_RAY" not in os.environ, reason="starts a Ray cluster, which takes minutes; set REDIG_TEST_RAY=1"
+)
+
 
 def test_a_run_that_loses_a_worker_midway_trains_to_its_end(tmp_path, monkeypatch):
     ray = pytest.importorskip("ray", reason="needs ray: pip install 'redig[ray]'")
