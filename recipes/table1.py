@@ -19,7 +19,7 @@ import time
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import IO, Any
 
 import torch
 import tyro
@@ -130,9 +130,9 @@ def train_all(wanted: list[Job], arguments: Arguments) -> dict[Job, str]:
         job.folder.mkdir(parents=True, exist_ok=True)
         started = time.perf_counter()
         with open(job.folder / "output.txt", "a") as output:
-            try:  # the recipe inherits the lock: it is held while it runs, even if this process is killed
-                fcntl.flock(output, fcntl.LOCK_EX | fcntl.LOCK_NB)
-            except BlockingIOError:
+            if not lock(
+                output
+            ):  # the recipe inherits the lock: it is held while it runs, even if this process is killed
                 return f"another process is training it in {job.folder}"
             if job.ready():  # one that has just ended
                 return None
@@ -164,6 +164,19 @@ def train_all(wanted: list[Job], arguments: Arguments) -> dict[Job, str]:
     if stop.is_set():
         raise SystemExit("stopped; the same command goes on from here")
     return {job: reason for job, reason in zip(missing, reasons, strict=True) if reason is not None}
+
+
+def lock(file: IO, patience: float = 5.0) -> bool:
+    """Lock a file, if its holder lets go within ``patience`` (s): what a recipe has started can outlive it a moment."""
+    end = time.monotonic() + patience
+    while True:
+        try:
+            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            return True
+        except BlockingIOError:
+            if time.monotonic() > end:
+                return False
+            time.sleep(0.1)
 
 
 def evaluate_job(job: Job, arguments: Arguments) -> None:

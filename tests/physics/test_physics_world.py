@@ -39,7 +39,7 @@ def test_driving_straight_covers_speed_times_time(speed, heading):
     run(world, [[speed, 0.0]], 2.0)
     along = (world.position[0] - start) @ [math.cos(heading), math.sin(heading)]
     assert along == pytest.approx(2 * speed, rel=0.01)
-    assert np.linalg.norm(world.position[0] - start) == pytest.approx(abs(along), rel=1e-3)
+    assert np.linalg.norm(world.position[0] - start) == pytest.approx(abs(along), rel=5e-3)
     assert world.velocity[0] @ [math.cos(heading), math.sin(heading)] == pytest.approx(speed, rel=0.02)
 
 
