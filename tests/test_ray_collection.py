@@ -15,7 +15,7 @@ from redig.envs import make_env
 from redig.objectives import MultiStep
 from redig.ray_collection import RayCollection
 
-pytestmark = pytest.mark.skipif(
+on_request = pytest.mark.skipif(
     "REDIG_TEST_RAY" not in os.environ, reason="starts a Ray cluster, which takes minutes; set REDIG_TEST_RAY=1"
 )
 
@@ -24,10 +24,12 @@ ENV = partial(make_env, formation="line", n_robots=3)
 
 
 def die_once(action, flag):
-    """Kill this process without notice if there is a flag; only one process finds it."""
+    """Kill this process without notice if there is a flag; only one process finds it. Raise if there is a fault."""
     if flag.exists():
         flag.unlink()
         os.kill(os.getpid(), signal.SIGKILL)
+    if flag.with_name("fault").exists():
+        raise RuntimeError("a fault of the policy")
     return action.clone()
 
 
@@ -52,6 +54,7 @@ def collection(flag=Path("no flag"), **options):
     return RayCollection(ENV, policy, **{**given, **options}), linear
 
 
+@on_request
 def test_a_worker_that_dies_while_it_collects_costs_no_batch(tmp_path):
     pytest.importorskip("ray", reason="needs ray: pip install 'redig[ray]'")
     cloudpickle.register_pickle_by_value(sys.modules[__name__])  # workers cannot import this file
@@ -73,6 +76,11 @@ def test_a_worker_that_dies_while_it_collects_costs_no_batch(tmp_path):
         assert again.shape == data.shape and (again[BASE] == 0.3).all()
         assert not torch.allclose(again[ACTION] - 0.3, data[ACTION] - 0.1)  # no repetition
         assert (next(experience)[BASE] == 0.3).all()
+
+        (tmp_path / "fault").touch()
+        with pytest.raises(RuntimeError, match="a fault of the policy"):
+            next(experience)
+        assert experience.restarts == 1
     finally:
         experience.shutdown()
 

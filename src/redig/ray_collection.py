@@ -1,11 +1,13 @@
 """Collection on a Ray cluster that goes on when it loses workers.
 
-TorchRL's ``RayCollector`` does not: its iterator ends with Ray's ``ActorDiedError`` and cannot be entered again, and
-the process group through which it sends weights has a fixed number of members, which a restarted worker cannot join.
+TorchRL's ``RayCollector`` (0.14.1) does not. Its iterator raises Ray's ``ActorDiedError``, or a ``RuntimeError`` of
+gloo where weights are sent to a worker that is gone; by then it has stopped the other workers too, and it yields
+nothing afterwards. Ray's own ``max_restarts`` does not help: the process group for weights takes no new member.
 """
 
 from __future__ import annotations
 
+import sys
 import warnings
 from collections.abc import Callable, Iterator
 from functools import partial
@@ -14,6 +16,7 @@ from typing import TYPE_CHECKING, Any
 import torch
 from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModuleBase
+from torchrl.collectors import Collector
 from torchrl.envs import EnvBase
 from torchrl.envs.utils import ExplorationType
 
@@ -84,16 +87,17 @@ class RayCollection(Iterator[TensorDictBase]):
 
     def __next__(self) -> TensorDictBase:
         """A batch; workers that are lost meanwhile are replaced first."""
-        from ray.exceptions import RayActorError
+        from ray.exceptions import RayActorError, RayTaskError
 
         for attempt in range(self.ATTEMPTS):
             try:
                 if self.collector is None:
                     self._start()
                 return next(self._batches)
-            except (RayActorError, RuntimeError) as error:  # RuntimeError: of a worker, or weights could not be sent
-                lost = isinstance(error, RayActorError) or self._unanswered()
-                if not lost or attempt + 1 == self.ATTEMPTS:
+            except RayTaskError:  # the environment or the policy has raised it: a new worker would do the same
+                raise
+            except (RayActorError, RuntimeError) as error:  # RuntimeError: weights could not be sent
+                if attempt + 1 == self.ATTEMPTS:
                     raise
                 warnings.warn(f"lost a worker, all are started again: {error}", stacklevel=2)
                 self.shutdown()
@@ -105,11 +109,6 @@ class RayCollection(Iterator[TensorDictBase]):
         if self.collector is not None:
             self.collector.shutdown()
             self.collector = None
-
-    def _unanswered(self) -> int:
-        if self.collector is None:  # its start has failed
-            return 0
-        return self.collector.num_collectors - self.collector.stats()["workers_alive"]
 
     def _start(self) -> None:
         import ray
@@ -131,11 +130,19 @@ class RayCollection(Iterator[TensorDictBase]):
             update_after_each_batch=True,
             postproc=self.postproc,
             exploration_type=ExplorationType.RANDOM,
+            collector_class=_Worker,
             collector_kwargs=[{"auto_register_policy_transforms": False} for _ in makers],
             remote_configs={"num_cpus": 1},
         )
         self.collector.update_policy_weights_()  # connects; after that, before each batch
         self._batches = iter(self.collector)
+
+
+class _Worker(Collector):
+    """A collector whose errors reach the caller: Ray asks for the length, and dies of TorchRL's infinite one."""
+
+    def __len__(self) -> int:
+        return sys.maxsize
 
 
 def _seeded(env_maker: Callable[..., EnvBase], num_envs: int, seed: int) -> EnvBase:
