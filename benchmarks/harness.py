@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import csv
 import platform
 import statistics
 import time
@@ -14,7 +13,7 @@ from typing import Any
 
 import torch
 
-from redig.files import replacing
+from redig.files import replacing, write_csv
 
 PACKAGES = ("torch", "torchrl", "tensordict", "vmas", "torch-geometric", "diffusers", "onnxruntime")
 
@@ -99,10 +98,7 @@ def report(
 ) -> None:
     """Write rows as ``name.csv`` and, with the machine and notes, as a Markdown table ``name.md``; print the table."""
     columns = list(dict.fromkeys(key for row in rows for key in row))
-    with replacing(folder / f"{name}.csv") as path, open(path, "w", newline="") as file:
-        writer = csv.DictWriter(file, columns)
-        writer.writeheader()
-        writer.writerows(rows)
+    write_csv(folder / f"{name}.csv", rows, columns)
     table = [f"| {' | '.join(columns)} |", "|" + "---|" * len(columns)]
     table += [f"| {' | '.join(_cell(row.get(column, '')) for column in columns)} |" for row in rows]
     lines = [f"Machine: {machine(threads)}.", "", *table, *(f"\n{note}" for note in notes)]

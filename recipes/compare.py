@@ -6,7 +6,6 @@ its configuration beside it; ``recipes/compare_plot.py`` draws what such files h
 
 from __future__ import annotations
 
-import csv
 import json
 import math
 import time
@@ -26,7 +25,7 @@ from torchrl.envs import EnvBase
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 
 from redig.envs.seeding import preserve_rng_state
-from redig.files import replacing
+from redig.files import replacing, write_csv
 
 EVALUATION_SEED = 10_000  # the same starts for all methods and seeds; far from the seeds of training
 COLUMNS = ("frames", "updates", "return_mean", "return_sd", "seconds", "loss_qvalue", "loss_actor")
@@ -77,10 +76,7 @@ def main(arguments: Arguments) -> Path:
     with replacing(path.with_suffix(".json")) as file:
         file.write_text(json.dumps(asdict(config), indent=2) + "\n")
     rows = train(config)
-    with replacing(path) as unfinished, open(unfinished, "w", newline="") as file:
-        writer = csv.DictWriter(file, COLUMNS)
-        writer.writeheader()
-        writer.writerows(rows)
+    write_csv(path, rows, COLUMNS)
     return path
 
 

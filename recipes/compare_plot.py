@@ -15,7 +15,7 @@ from compare_methods import METHODS
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from redig.files import replacing
+from redig.files import replacing, write_csv
 from redig.viz.scene import PALETTE, check_suffix
 
 MARKERS = "os^Dv<P"
@@ -46,10 +46,7 @@ def main(arguments: Arguments) -> str:
         for seed, curve in seeds.items()
         for row in curve
     ]
-    with replacing(arguments.out / "curves.csv") as path, open(path, "w", newline="") as file:
-        writer = csv.DictWriter(file, fieldnames=list(rows[0]))
-        writer.writeheader()
-        writer.writerows(rows)
+    write_csv(arguments.out / "curves.csv", rows)
     with replacing(figure_path) as path:
         draw(curves).savefig(path, dpi=200)
     table = markdown(curves)

@@ -15,7 +15,7 @@ import tyro
 from compare_methods import METHODS
 from compare_tasks import GYM
 
-from redig.files import replacing
+from redig.files import write_csv
 
 RATES = (3e-4, 1e-3)
 DDPG_RATES = (1e-4, *RATES)  # its actor saturates at high rates
@@ -56,10 +56,7 @@ def main(arguments: Arguments) -> list[dict[str, object]]:
                 last = list(csv.DictReader(file))[-1]
             result = {"final_return": float(last["return_mean"]), "return_sd": float(last["return_sd"])}
             rows.append({"task": task, "method": method, "seed": arguments.seed, **change, **result})
-            with replacing(arguments.out / "tuning.csv") as unfinished, open(unfinished, "w", newline="") as file:
-                writer = csv.DictWriter(file, fieldnames=list(rows[0]))
-                writer.writeheader()
-                writer.writerows(rows)
+            write_csv(arguments.out / "tuning.csv", rows)
     return rows
 
 

@@ -26,9 +26,9 @@ from redig.deploy.robot import RobotPolicy
 from redig.deploy.transport import Faults, Radio, Sensed
 from redig.envs.factory import make_env
 from redig.evaluation import evaluate
-from redig.files import replacing
+from redig.files import write_csv
 from redig.policy import OBSERVATION, read_header
-from redig.viz.scene import PALETTE
+from redig.viz.scene import PALETTE, save_figure
 
 ACTION = ("agents", "action")
 RATES = ("success_rate", "team_success_rate")
@@ -215,9 +215,8 @@ def main(arguments: Arguments) -> list[dict[str, str]]:
                     {**point, "starts": str(arguments.starts), **{rate: f"{metrics[rate]:.4f}" for rate in RATES}}
                 )
                 print(*rows[-1].values(), flush=True)
-                write(file, rows)
-    with replacing(arguments.out / "faults.png") as path:
-        draw(rows).savefig(path, dpi=200)
+                write_csv(file, rows)
+    save_figure(draw(rows), arguments.out / "faults.png")
     return rows
 
 
@@ -227,14 +226,6 @@ def read(file: Path) -> list[dict[str, str]]:
         return []
     with open(file, newline="") as lines:
         return list(csv.DictReader(lines))
-
-
-def write(file: Path, rows: Sequence[dict[str, str]]) -> None:
-    """All rows, in place of what was there."""
-    with replacing(file) as path, open(path, "w", newline="") as lines:
-        writer = csv.DictWriter(lines, fieldnames=list(rows[0]))
-        writer.writeheader()
-        writer.writerows(rows)
 
 
 def draw(rows: Sequence[dict[str, str]]) -> Figure:

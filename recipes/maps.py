@@ -5,7 +5,6 @@
 
 from __future__ import annotations
 
-import csv
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -17,7 +16,7 @@ from matplotlib.patches import Circle
 from redig.envs import EVALUATION_MAPS, MAP_KINDS, make_env
 from redig.envs.map_batch import map_at
 from redig.evaluation import evaluate
-from redig.files import replacing
+from redig.files import replacing, write_csv
 from redig.policy import load_policy, read_header
 from redig.viz.scene import INK, SHAPE, draw_map, formation_outline, robot_style
 
@@ -91,10 +90,7 @@ def measure(file: Path, starts: int, seed: int, folder: Path) -> None:
         metrics = evaluate(policy, env, seed=seed)
         rows.append({"map": kind, **{name: round(metrics[name], 4) for name in SHOWN}})
         print(rows[-1])
-    with replacing(folder / "zero_shot.csv") as path, open(path, "w", newline="") as sheet:
-        writer = csv.DictWriter(sheet, fieldnames=list(rows[0]))
-        writer.writeheader()
-        writer.writerows(rows)
+    write_csv(folder / "zero_shot.csv", rows)
     body = [["-" if value != value else str(value) for value in row.values()] for row in rows]
     cells = [list(rows[0]), ["---"] * len(rows[0]), *body]
     with replacing(folder / "table.md") as path:

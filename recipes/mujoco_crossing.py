@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import csv
 import time
 from dataclasses import dataclass
 from pathlib import Path
@@ -17,7 +16,7 @@ from torch import Tensor
 
 from redig.envs.factory import make_env
 from redig.evaluation import rollout_trajectories, team_metrics
-from redig.files import replacing
+from redig.files import replacing, write_csv
 from redig.physics import Ground, PhysicsNavigation, RobotBody
 from redig.policy import load_policy, read_header
 from redig.viz import animate, plot_trajectories
@@ -142,10 +141,8 @@ def main(arguments: Arguments) -> list[dict[str, Any]]:
         rows.append({"case": name, "starts": arguments.starts, "seed": arguments.seed, **figures})
         print(f"{name:22}" + ", ".join(f"{key} {figures[key]:.3f}" for key in SHOWN), flush=True)
     arguments.out.mkdir(parents=True, exist_ok=True)
-    with replacing(arguments.out / f"{formation}.csv") as path, open(path, "w", newline="") as file:
-        writer = csv.DictWriter(file, fieldnames=list(rows[0]))
-        writer.writeheader()
-        writer.writerows({k: f"{v:.6g}" if isinstance(v, float) else v for k, v in row.items()} for row in rows)
+    shown = [{k: f"{v:.6g}" if isinstance(v, float) else v for k, v in row.items()} for row in rows]
+    write_csv(arguments.out / f"{formation}.csv", shown)
     if arguments.film == "render":
         film(arguments.out / f"{formation}.mp4", policy, scenario, arguments.seed)
     elif arguments.film == "plan":

@@ -17,7 +17,9 @@ import ppo_gnn
 import tyro
 from finish import score
 from ppo_config import PPOConfig
-from seeds import numbers, write_csv
+from seeds import numbers
+
+from redig.files import write_csv
 
 OUT = Path("runs/ppo-tuning")
 SHOWN = ("updates", "success_rate", "team_success_rate", "travel_time", "cfi_0.5", "jerk_mean")

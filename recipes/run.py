@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import csv
 import importlib.util
 import json
 import math
@@ -29,7 +28,7 @@ from redig.checkpoint import (
     set_buffer_state,
     set_rng_state,
 )
-from redig.files import replacing
+from redig.files import replacing, write_csv
 
 LOGGERS = ("csv", "tensorboard", "wandb")
 
@@ -151,10 +150,7 @@ class Run:
         }
         shown = ("success_rate", "team_success_rate", "travel_time", "cfi_0.5", "jerk_mean")
         tqdm.write(f"{phase}, {updates} updates: " + ", ".join(f"{name} {metrics[name]:.3f}" for name in shown))
-        with replacing(self.folder / "evaluations.csv") as path, open(path, "w", newline="") as file:
-            writer = csv.DictWriter(file, fieldnames=list(self.evaluations[0]))
-            writer.writeheader()
-            writer.writerows(self.evaluations)
+        write_csv(self.folder / "evaluations.csv", self.evaluations)
 
     def checkpoint(self) -> None:
         """Write the state of the run; a checkpoint is complete or not there at all."""

@@ -5,7 +5,6 @@ Writes ``samplers.csv`` and ``smoothness.csv``, one row a policy and setting, an
 
 from __future__ import annotations
 
-import csv
 import math
 import statistics
 import time
@@ -27,7 +26,7 @@ from tqdm import tqdm
 from redig.envs.factory import make_env
 from redig.envs.seeding import preserve_rng_state
 from redig.evaluation import evaluate
-from redig.files import replacing
+from redig.files import replacing, write_csv
 from redig.modules import DDIM, DDPM, BestOfN, DPMSolver, Sampler
 from redig.policy import load_policy, read_header
 
@@ -156,10 +155,7 @@ def latency(policy: TensorDictSequential, state: Tensor, repeats: int = 30) -> f
 
 def write(path: Path, rows: list[dict[str, Any]], keys: list[str]) -> None:
     """The rows as CSV, and their mean and standard deviation over policies as a Markdown table."""
-    with replacing(path.with_suffix(".csv")) as unfinished, open(unfinished, "w", newline="") as file:
-        writer = csv.DictWriter(file, list(rows[0]))
-        writer.writeheader()
-        writer.writerows(rows)
+    write_csv(path.with_suffix(".csv"), rows)
     columns = [name for name in rows[0] if name not in ("policy", *keys)]
     groups: dict[tuple, list[dict[str, Any]]] = {}
     for row in rows:

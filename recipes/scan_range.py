@@ -7,7 +7,6 @@ with the range as distance. Writes ``scan_range.csv``.
 
 from __future__ import annotations
 
-import csv
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -19,7 +18,7 @@ from torch import Tensor
 
 from redig.envs.factory import make_env
 from redig.evaluation import evaluate
-from redig.files import replacing
+from redig.files import write_csv
 from redig.policy import OBSERVATION, load_policy, read_header
 
 FIGURES = ("success_rate", "team_success_rate", "travel_time", "cfi_0.5")
@@ -55,10 +54,7 @@ def main(arguments: Arguments) -> list[dict[str, Any]]:
                 | {name: round(metrics[name], 4) for name in FIGURES}
             )
             print(*rows[-1].values(), sep="\t", flush=True)
-    with replacing(arguments.out / "scan_range.csv") as file, open(file, "w", newline="") as stream:
-        writer = csv.DictWriter(stream, list(rows[0]))
-        writer.writeheader()
-        writer.writerows(rows)
+    write_csv(arguments.out / "scan_range.csv", rows)
     return rows
 
 

@@ -11,7 +11,7 @@ from typing import Annotated
 
 import tyro
 
-from redig.files import replacing
+from redig.files import replacing, write_csv
 from redig.viz import plot_learning_curves
 
 SHOWN = (
@@ -68,14 +68,6 @@ def spread(values: list[float | None]) -> str:
 def numbers(row: dict[str, str]) -> dict[str, float]:
     """The columns of a CSV row that hold numbers."""
     return {key: float(value) for key, value in row.items() if key != "phase"}
-
-
-def write_csv(path: Path, rows: list[dict]) -> None:
-    """Write rows with equal keys as CSV."""
-    with replacing(path) as unfinished, open(unfinished, "w", newline="") as file:
-        writer = csv.DictWriter(file, fieldnames=list(rows[0]))
-        writer.writeheader()
-        writer.writerows(rows)
 
 
 if __name__ == "__main__":

@@ -6,7 +6,6 @@ does a part, ``--no-train`` trains nothing, ``--help`` explains each option.
 
 from __future__ import annotations
 
-import csv
 import fcntl
 import json
 import os
@@ -31,7 +30,7 @@ from tqdm import tqdm
 from redig.envs import FORMATIONS
 from redig.envs.factory import make_env
 from redig.evaluation import evaluate_teams
-from redig.files import replacing
+from redig.files import replacing, write_csv
 
 
 @dataclass
@@ -186,10 +185,7 @@ def evaluate_job(job: Job, arguments: Arguments) -> None:
         return
     env = make_env(arguments.starts, **scenario)
     metrics = {key: value.tolist() for key, value in evaluate_teams(load(job, env), env, TEST_SEED).items()}
-    with replacing(path) as unfinished, open(unfinished, "w", newline="") as file:
-        writer = csv.writer(file)
-        writer.writerow(metrics)
-        writer.writerows(zip(*metrics.values(), strict=True))
+    write_csv(path, [dict(zip(metrics, start, strict=True)) for start in zip(*metrics.values(), strict=True)])
     with replacing(job.folder / "scenario.json") as unfinished:
         unfinished.write_text(json.dumps(scenario, indent=2) + "\n")
 

@@ -11,7 +11,7 @@ import numpy as np
 from finish import TEST_SEED
 from table1_methods import METHODS, Job
 
-from redig.files import replacing
+from redig.files import replacing, write_csv
 
 COLUMNS = {  # metric: head of the column, factor, digits
     "success_rate": ("robots (%)", 100, 1),
@@ -58,10 +58,7 @@ def write_report(out: Path, done: Sequence[Job], command: str) -> str:
         run = {"method": job.method, "formation": job.formation, "seed": "" if job.seed is None else str(job.seed)}
         cost = {"frames": job.frames(), "seconds": round(job.seconds(), 1), "starts": len(metrics["success_rate"])}
         rows.append({**run, **cost, **{name: nanmean(values) for name, values in metrics.items()}})
-    with replacing(out / "seeds.csv") as unfinished, open(unfinished, "w", newline="") as file:
-        writer = csv.DictWriter(file, list(rows[0]) if rows else [])
-        writer.writeheader()
-        writer.writerows(rows)
+    write_csv(out / "seeds.csv", rows)
     formations = dict.fromkeys(job.formation for job in done)
     table = "\n".join([head(command, starts), *(formation_table(formation, starts) for formation in formations)])
     with replacing(out / "table.md") as file:

@@ -15,7 +15,6 @@ import torch
 import tyro
 from config import Config
 from redig_wedge import copy_to_targets, make_loss, make_optimizers, policy_architecture, transitions
-from seeds import write_csv
 from tensordict import TensorDict, TensorDictBase
 from tensordict.nn import TensorDictSequential
 from theory_plot import draw
@@ -35,7 +34,7 @@ from redig.evaluation import (
     prior_mismatch,
     prior_mismatch_floor,
 )
-from redig.files import replacing
+from redig.files import replacing, write_csv
 from redig.modules import DDIM, DDPM, NoiseSchedule
 from redig.modules.samplers import Denoise
 from redig.objectives import DIPOLoss, MultiStep

@@ -8,7 +8,6 @@ moves in any direction. A base (an ideal unicycle, integrated exactly) follows t
 
 from __future__ import annotations
 
-import csv
 import math
 from collections.abc import Callable
 from dataclasses import dataclass, replace
@@ -25,7 +24,7 @@ from torchrl.envs.utils import ExplorationType, set_exploration_type
 
 from redig.deploy import LIMO, WARTHOG, Base, DifferentialDrive
 from redig.envs.factory import make_env
-from redig.files import replacing
+from redig.files import replacing, write_csv
 from redig.policy import OBSERVATION, load_policy, read_header
 from redig.viz.scene import PALETTE
 
@@ -81,10 +80,7 @@ def main(arguments: Arguments) -> list[dict[str, Any]]:
                         }
                     )
                     print(*rows[-1].values(), sep="\t")
-    with replacing(arguments.out / "tracking.csv") as file, open(file, "w", newline="") as stream:
-        writer = csv.DictWriter(stream, list(rows[0]))
-        writer.writeheader()
-        writer.writerows(rows)
+    write_csv(arguments.out / "tracking.csv", rows)
     with replacing(arguments.out / "tracking.png") as file:
         draw(paths, drawn, arguments.feedback).savefig(file, dpi=130)
     return rows

@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import csv
 import os
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
+from typing import Any
 
 
 @contextmanager
@@ -32,3 +34,31 @@ def replacing(path: str | Path) -> Iterator[Path]:
         os.replace(unfinished, path)
     finally:
         unfinished.unlink(missing_ok=True)
+
+
+def write_csv(path: str | Path, rows: Sequence[Mapping[str, Any]], columns: Sequence[str] | None = None) -> None:
+    """Write rows as CSV, in place of what was there.
+
+    Args:
+        path: of the file.
+        rows: with the keys of the first, unless ``columns`` are given; what a row does not have is left empty.
+        columns: heads, in order.
+
+    Raises:
+        ValueError: if a row has another key.
+
+    Examples:
+        >>> import tempfile
+        >>> with tempfile.TemporaryDirectory() as folder:
+        ...     write_csv(f"{folder}/seeds.csv", [{"seed": 0, "robots": 1.0}, {"seed": 1, "robots": 0.5}])
+        ...     print(Path(f"{folder}/seeds.csv").read_text())
+        seed,robots
+        0,1.0
+        1,0.5
+        <BLANKLINE>
+    """
+    heads = list(rows[0] if rows else ()) if columns is None else columns
+    with replacing(path) as unfinished, open(unfinished, "w", newline="") as file:
+        writer = csv.DictWriter(file, heads)
+        writer.writeheader()
+        writer.writerows(rows)
