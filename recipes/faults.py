@@ -27,10 +27,9 @@ from redig.deploy.transport import Faults, Radio, Sensed
 from redig.envs.factory import make_env
 from redig.evaluation import evaluate
 from redig.files import write_csv
-from redig.policy import OBSERVATION, read_header
+from redig.policy import ACTION, OBSERVATION, read_header
 from redig.viz.scene import PALETTE, save_figure
 
-ACTION = ("agents", "action")
 RATES = ("success_rate", "team_success_rate")
 
 
@@ -150,9 +149,7 @@ class Team:
         return [(transport.commanded.forward, transport.commanded.left) for transport in self._transports]
 
     def _speak(self, i: int, row: list[float]) -> None:
-        x, y, vx, vy, gx, gy, distance, ox, oy = row
-        stamp = self._radio.now + self._offsets[i]
-        state = RobotState(self._names[i], stamp, (x, y), (vx, vy), (x + gx, y + gy), distance, (ox, oy))
+        state = RobotState.of_observation(self._names[i], self._radio.now + self._offsets[i], row)
         self._transports[i].sensed = Sensed(state, heading=0.0)
         self._nodes[i].tell()
         if self._random.random() < self._case.lies:

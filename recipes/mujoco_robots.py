@@ -13,7 +13,7 @@ import numpy as np
 import torch
 import tyro
 from robots import Arguments as WorldArguments
-from robots import Robot
+from robots import Robot, wait_for
 from tensordict import TensorDict
 
 from redig.deploy.dds import DDSWorld
@@ -51,20 +51,6 @@ class WheeledRobot(Robot):
     def __init__(self, arguments: Arguments, robot: str, robots: list[str]) -> None:
         super().__init__(arguments, robot, robots)
         self._command += ["--drive", arguments.drive, "--deadline", str(0.1 / arguments.speed)]
-
-
-def wait_for(robots: list[str], network: DDSWorld, timeout: float = 300.0) -> None:
-    """Wait until every robot has sent a command.
-
-    Raises:
-        TimeoutError: naming the robots that have not, after ``timeout`` (s).
-    """
-    silent, given_up = set(robots), time.monotonic() + timeout
-    while silent:
-        if time.monotonic() > given_up:
-            raise TimeoutError(f"no command from {', '.join(sorted(silent))} after {timeout:g} s; see their logs")
-        time.sleep(0.1)
-        silent -= set(network.commands())
 
 
 def cross(team: LiveTeam, scenario: FormationNavigation, start: int, speed: float, max_steps: int = 200) -> TensorDict:
@@ -118,7 +104,7 @@ def main(arguments: Arguments) -> dict[str, float]:
         if arguments.spawn:
             for robot in robots:
                 stack.enter_context(WheeledRobot(arguments, robot, robots))
-        wait_for(robots, network)
+        wait_for(network, robots, seconds=300.0)
         for start in range(arguments.starts):
             runs.append(cross(team, scenario, start, arguments.speed))
             print(f"start {start}: {runs[-1]['arrived'][0, -1].sum()} arrived", flush=True)

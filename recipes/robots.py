@@ -7,6 +7,7 @@ import sys
 import time
 from contextlib import ExitStack
 from dataclasses import dataclass
+from itertools import repeat
 from pathlib import Path
 from typing import Annotated
 
@@ -21,9 +22,7 @@ from redig.deploy.record import Recorder
 from redig.deploy.transport import BodyVelocity, Sensed
 from redig.envs.factory import make_env
 from redig.evaluation import evaluate, format_table, write_metrics
-from redig.policy import OBSERVATION, read_header
-
-ACTION = ("agents", "action")
+from redig.policy import ACTION, OBSERVATION, read_header
 
 
 @dataclass
@@ -78,7 +77,8 @@ class RemoteTeam:
         if self._goal.shape != goal.shape or not torch.allclose(goal, self._goal, atol=1e-3):
             self._new_start(goal)
         now = time.time()
-        team = [self._sensed(robot, now, row) for robot, row in zip(self._robots, observation[0].tolist(), strict=True)]
+        states = map(RobotState.of_observation, self._robots, repeat(now), observation[0].tolist())
+        team = [Sensed(state, heading=0.0) for state in states]
         for sensed in team:
             self._world.publish(sensed)
         self._due = max(self._due + self._step, time.monotonic())
@@ -90,11 +90,6 @@ class RemoteTeam:
             for sensed, (forward, left) in zip(team, commands, strict=True):
                 self._recorder.write(sensed, BodyVelocity(forward, left, 0.0))
         return torch.tensor([commands])
-
-    @staticmethod
-    def _sensed(robot: str, now: float, row: list[float]) -> Sensed:
-        x, y, vx, vy, gx, gy, distance, ox, oy = row
-        return Sensed(RobotState(robot, now, (x, y), (vx, vy), (x + gx, y + gy), distance, (ox, oy)), heading=0.0)
 
     def _current(self, robot: str, now: float) -> tuple[float, float]:
         at, command = self._commands.get(robot, (-float("inf"), BodyVelocity(0.0, 0.0, 0.0)))

@@ -10,8 +10,9 @@ from tensordict.nn import TensorDictModuleBase
 from torch import Tensor
 
 from redig.envs.navigation import FormationNavigation
+from redig.policy import ACTION, OBSERVATION
 
-OBSERVATION, ACTION, STEP = ("agents", "observation"), ("agents", "action"), "step_count"
+STEP = "step_count"
 
 
 class EpisodePlanner(TensorDictModuleBase):

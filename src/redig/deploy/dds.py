@@ -13,7 +13,7 @@ from typing import Any
 from xml.sax.saxutils import quoteattr
 
 from redig.deploy.events import Events
-from redig.deploy.messages import RobotState, Vector
+from redig.deploy.messages import Vector
 from redig.deploy.ros2_types import (
     Header,
     Point,
@@ -26,7 +26,16 @@ from redig.deploy.ros2_types import (
     Vector3,
     Vector3Stamped,
 )
-from redig.deploy.ros_state import Obstacle, StateParts, check_namespace, full_name, to_quaternion
+from redig.deploy.ros_state import (
+    DEPTH,
+    STATE_TOPICS,
+    Obstacle,
+    StateParts,
+    StateTransport,
+    check_namespace,
+    to_quaternion,
+    topic_names,
+)
 from redig.deploy.transport import BodyVelocity, Sensed
 
 try:
@@ -40,12 +49,11 @@ except ImportError as error:
 
 LARGEST_DOMAIN = 232  # ports of larger ones are above 65535
 RELIABLE = Qos(Policy.Reliability.Reliable(0), Policy.History.KeepLast(1))  # what ROS 2's readers ask of a writer
-STATE_TOPICS = {"pose": PoseStamped, "twist": TwistStamped, "goal": PoseStamped, "obstacle": Vector3Stamped}
-DEPTH = 8  # messages of one topic that are kept between two looks
+KINDS = dict(zip(STATE_TOPICS, (PoseStamped, TwistStamped, PoseStamped, Vector3Stamped), strict=True))
 log = logging.getLogger(__name__)
 
 
-class DDSTransport:
+class DDSTransport(StateTransport):
     """One robot: its own state from topics of its namespace, ``cmd_vel`` to it, and states from and to its neighbours.
 
     ===============  ==================  ====================================================================
@@ -93,31 +101,16 @@ class DDSTransport:
         goal: Vector | None = None,
         obstacle: Obstacle | None = None,
     ) -> None:
-        robot = check_namespace("namespace", namespace)
-        mates = [check_namespace("neighbours", mate) for mate in neighbours]
-        names = {name: full_name(robot, name, topics or {}) for name in (*STATE_TOPICS, "cmd_vel")}
+        robot, names, mates = topic_names(namespace, neighbours, topics or {})
         self._network = Network(domain_id, interface, peers)
         self._own = _StateReader(self._network, StateParts(robot, goal, obstacle), names)
-        self._mates = [
-            _StateReader(self._network, StateParts(mate), {name: f"{mate}/team/{name}" for name in STATE_TOPICS})
-            for mate in mates
-            if mate != robot
-        ]
+        self._mates = [_StateReader(self._network, StateParts(mate), theirs) for mate, theirs in mates.items()]
         self._states = _StateWriter(self._network, f"{robot}/team")
         self._commands = self._network.writer(names["cmd_vel"], Twist)
-
-    def sense(self) -> Sensed | None:
-        """This robot's own state, once all of its parts have come anew."""
-        states = self._own.take()
-        return states[-1] if states else None
 
     def send(self, sensed: Sensed) -> None:
         """Publish a state for neighbours, in the frame of the pose."""
         self._states.write(sensed, self._own.parts.frame)
-
-    def receive(self) -> list[RobotState]:
-        """States of neighbours, each once all of its parts have come anew."""
-        return [sensed.state for mate in self._mates for sensed in mate.take()]
 
     def command(self, velocity: BodyVelocity) -> None:
         """Publish a ``Twist``."""
@@ -141,6 +134,7 @@ class DDSWorld:
         ValueError: likewise.
 
     Examples:
+        >>> from redig.deploy.messages import RobotState
         >>> world = DDSWorld(["robot_0"], domain_id=7)
         >>> state = RobotState("robot_0", 1.5, (0.0, 1.0), (0.3, 0.0), (5.5, 1.0), 0.8, (0.0, -1.0))
         >>> world.publish(Sensed(state, heading=0.0))
@@ -193,7 +187,7 @@ class _StateReader:
             "obstacle": parts.hear_obstacle,
             "pose": lambda message: parts.hear_pose(message, message.header.stamp.seconds()),
         }
-        self._sources = [(network.reader(topics[name], STATE_TOPICS[name]), hear[name]) for name in hear]
+        self._sources = [(network.reader(topics[name], KINDS[name]), hear[name]) for name in hear]
 
     def take(self) -> list[Sensed]:
         """States that have been completed since the last call."""
@@ -213,7 +207,7 @@ class _StateWriter:
     """The other end of :class:`_StateReader`, for topics of the same names in ``namespace``."""
 
     def __init__(self, network: Network, namespace: str) -> None:
-        self._write = {name: network.writer(f"{namespace}/{name}", kind).write for name, kind in STATE_TOPICS.items()}
+        self._write = {name: network.writer(f"{namespace}/{name}", kind).write for name, kind in KINDS.items()}
 
     def write(self, sensed: Sensed, frame: str) -> None:
         """Publish a state, all of it in one frame."""

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -42,6 +43,22 @@ class RobotState:
     goal: Vector
     obstacle_distance: float
     obstacle_direction: Vector
+
+    @classmethod
+    def of_observation(cls, robot: str, stamp: float, observation: Sequence[float]) -> RobotState:
+        """The state that nine numbers of :class:`~redig.envs.FormationNavigation` tell of.
+
+        Examples:
+            >>> RobotState.of_observation("robot_0", 12.5, [0.0, 1.0, 0.3, 0.0, 5.5, 0.0, 0.8, 0.0, -1.0]).goal
+            (5.5, 1.0)
+        """
+        x, y, vx, vy, goal_x, goal_y, distance, ox, oy = observation
+        return cls(robot, stamp, (x, y), (vx, vy), (x + goal_x, y + goal_y), distance, (ox, oy))
+
+    def observation(self) -> list[float]:
+        """The same nine numbers: position, velocity, goal - position, distance and direction of the obstacle."""
+        (x, y), (goal_x, goal_y) = self.position, self.goal
+        return [x, y, *self.velocity, goal_x - x, goal_y - y, self.obstacle_distance, *self.obstacle_direction]
 
     def check(self) -> None:
         """Make sure that a policy can use this; whether it is true or fresh, only the receiver can judge.

@@ -61,7 +61,7 @@ class ModulePolicy:
         self.width, self.stochastic = config.observation_dim, stochastic
         encoder, actor = load_policy(path, sampler=sampler)
         policy = actor.module
-        self._low, self._high = policy.low, policy.high
+        self._denormalize, self._action_dim = policy.denormalize, len(policy.low)
         self._denoiser = denoiser_step(policy.denoiser)
         self._before = Condition(encoder.module, self._denoiser, ego=True)
         transitions = chain_transitions(policy.sampler, policy.schedule, deterministic=not stochastic)
@@ -99,12 +99,11 @@ class ModulePolicy:
             action = transition.c0 * clean + transition.ck * action + transition.c_older * older
             if transition.sigma > 0:
                 action, drawn = action + transition.sigma * added[drawn], drawn + 1
-        action = self._low + (action + 1) * (self._high - self._low) / 2
-        return action.maximum(self._low).minimum(self._high).squeeze(0).numpy()
+        return self._denormalize(action).squeeze(0).numpy()
 
     def _drawn(self, name: str, value: ArrayLike | None, shape: list[int]) -> Tensor:
         """Latent ``[1, A]`` or noise ``[S, 1, A]``, given without the one; zeros for a policy without noise."""
-        shape = [*shape, len(self._low)]
+        shape = [*shape, self._action_dim]
         if value is None:
             drawn = self._generator.standard_normal(shape, np.float32) if self.stochastic else np.zeros(shape)
             return torch.from_numpy(drawn).float()

@@ -12,6 +12,7 @@ from redig.deploy.drive import DifferentialDrive
 from redig.deploy.events import Events
 from redig.deploy.messages import Vector
 from redig.deploy.pilot import STAND, Pilot
+from redig.deploy.proximity import to_robot
 from redig.deploy.transport import BodyVelocity, Transport
 
 Drive = Callable[[Vector, float], BodyVelocity]
@@ -137,5 +138,4 @@ def holonomic(velocity: Vector, heading: float) -> BodyVelocity:
         >>> round(forward, 6), round(left, 6), turn
         (1.0, 0.0, 0.0)
     """
-    cos, sin = math.cos(heading), math.sin(heading)
-    return BodyVelocity(cos * velocity[0] + sin * velocity[1], cos * velocity[1] - sin * velocity[0], 0.0)
+    return BodyVelocity(*to_robot(velocity, heading), 0.0)

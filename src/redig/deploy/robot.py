@@ -106,14 +106,8 @@ class RobotPolicy:
             if state.robot in seen:
                 raise ValueError(f"neighbours: got more than one state of {state.robot}, must be one a robot")
             seen.add(state.robot)
-        observation = np.array([_observation(state) for state in states], np.float32)
+        observation = np.array([state.observation() for state in states], np.float32)
         return self.network(observation[:, : self.network.width], latent=latent, noise=noise)
-
-
-def _observation(state: RobotState) -> list[float]:
-    """The numbers of :class:`~redig.envs.FormationNavigation`, in its order."""
-    (x, y), (goal_x, goal_y) = state.position, state.goal
-    return [x, y, *state.velocity, goal_x - x, goal_y - y, state.obstacle_distance, *state.obstacle_direction]
 
 
 def _load(path: str | Path) -> _Network:

@@ -10,16 +10,22 @@ from functools import partial
 from types import SimpleNamespace
 from typing import Any
 
-from redig.deploy.messages import RobotState, Vector
-from redig.deploy.ros_state import Obstacle, StateParts, check_namespace, full_name, to_quaternion
+from redig.deploy.messages import Vector
+from redig.deploy.ros_state import (
+    DEPTH,
+    STATE_TOPICS,
+    Obstacle,
+    StateParts,
+    StateTransport,
+    to_quaternion,
+    topic_names,
+)
 from redig.deploy.transport import BodyVelocity, Sensed
 
 DEBIAN = "/usr/lib/python3/dist-packages"  # behind the environment's own packages, never ahead of them
-STATE_TOPICS = ("pose", "twist", "goal", "obstacle")
-DEPTH = 8  # messages of one topic that are kept between two looks
 
 
-class ROS1Transport:
+class ROS1Transport(StateTransport):
     """One robot in the graph of ``ROS_MASTER_URI``: topics and types as of :class:`redig.deploy.dds.DDSTransport`.
 
     Args:
@@ -48,26 +54,15 @@ class ROS1Transport:
         goal: Vector | None = None,
         obstacle: Obstacle | None = None,
     ) -> None:
-        robot = check_namespace("namespace", namespace)
-        mates = [check_namespace("neighbours", mate) for mate in neighbours]
-        names = {name: full_name(robot, name, topics or {}) for name in (*STATE_TOPICS, "cmd_vel")}
+        robot, names, mates = topic_names(namespace, neighbours, topics or {})
         self._ros = ros = _import()
         ros.rospy.init_node(f"redig_{robot.replace('/', '_')}", disable_signals=True)
         self._own = _StateReader(ros, StateParts(robot, goal, obstacle), names)
-        self._mates = [
-            _StateReader(ros, StateParts(mate), {name: f"{mate}/team/{name}" for name in STATE_TOPICS})
-            for mate in mates
-            if mate != robot
-        ]
+        self._mates = [_StateReader(ros, StateParts(mate), theirs) for mate, theirs in mates.items()]
         self._states = {
             name: ros.rospy.Publisher(f"/{robot}/team/{name}", ros.kinds[name], queue_size=1) for name in STATE_TOPICS
         }
         self._commands = ros.rospy.Publisher(f"/{names['cmd_vel']}", ros.messages.Twist, queue_size=1)
-
-    def sense(self) -> Sensed | None:
-        """This robot's own state, once all of its parts have come anew."""
-        states = self._own.take()
-        return states[-1] if states else None
 
     def send(self, sensed: Sensed) -> None:
         """Publish a state for neighbours, in the frame of the pose."""
@@ -80,10 +75,6 @@ class ROS1Transport:
         self._states["goal"].publish(header, of.Pose(position=of.Point(*state.goal, 0.0)))
         self._states["obstacle"].publish(header, of.Vector3(distance * x, distance * y, 0.0))
         self._states["pose"].publish(header, place)
-
-    def receive(self) -> list[RobotState]:
-        """States of neighbours, each once all of its parts have come anew."""
-        return [sensed.state for mate in self._mates for sensed in mate.take()]
 
     def command(self, velocity: BodyVelocity) -> None:
         """Publish a ``Twist``."""

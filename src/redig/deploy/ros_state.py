@@ -4,12 +4,15 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Callable, Mapping
-from typing import Any
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any, Protocol
 
 from redig.deploy.messages import RobotState, Vector
+from redig.deploy.proximity import to_world
 from redig.deploy.transport import Sensed
 
+STATE_TOPICS = ("pose", "twist", "goal", "obstacle")
+DEPTH = 8  # messages of one topic that are kept between two looks
 Obstacle = Callable[[Vector], tuple[float, Vector]]  # position (m) to the nearest obstacle's distance (m) and direction
 
 
@@ -78,6 +81,56 @@ class StateParts:
         else:
             distance, direction = polar(_in_frame(vector.vector, vector.header.frame_id, self.frame, heading))
         return Sensed(RobotState(self.robot, stamp, position, velocity, self.goal, distance, direction), heading)
+
+
+class _Reader(Protocol):
+    """Completed states of one robot, from a version of ROS; ``parts`` puts them together."""
+
+    parts: StateParts
+
+    def take(self) -> list[Sensed]:
+        """States that have been completed since the last call."""
+
+
+class StateTransport:
+    """What transports over either version of ROS share: the own state and those of neighbours, read from topics.
+
+    Examples:
+        >>> from redig.deploy.ros1 import ROS1Transport
+        >>> issubclass(ROS1Transport, StateTransport)
+        True
+    """
+
+    _own: _Reader
+    _mates: Sequence[_Reader]
+
+    def sense(self) -> Sensed | None:
+        """This robot's own state, once all of its parts have come anew."""
+        states = self._own.take()
+        return states[-1] if states else None
+
+    def receive(self) -> list[RobotState]:
+        """States of neighbours, each once all of its parts have come anew."""
+        return [sensed.state for mate in self._mates for sensed in mate.take()]
+
+
+def topic_names(
+    namespace: str, neighbours: Sequence[str], topics: Mapping[str, str]
+) -> tuple[str, dict[str, str], dict[str, dict[str, str]]]:
+    """The robot's name, the names of its topics, and those of the states of each neighbour other than itself.
+
+    Raises:
+        ValueError: if ROS would not take one.
+
+    Examples:
+        >>> robot, own, mates = topic_names("/robot_0", ["robot_0", "robot_1"], {"pose": "/amcl/pose"})
+        >>> robot, own["pose"], own["cmd_vel"], mates["robot_1"]["goal"], len(mates)
+        ('robot_0', 'amcl/pose', 'robot_0/cmd_vel', 'robot_1/team/goal', 1)
+    """
+    robot = check_namespace("namespace", namespace)
+    mates = [check_namespace("neighbours", mate) for mate in neighbours]
+    own = {name: full_name(robot, name, topics) for name in (*STATE_TOPICS, "cmd_vel")}
+    return robot, own, {mate: {name: f"{mate}/team/{name}" for name in STATE_TOPICS} for mate in mates if mate != robot}
 
 
 def polar(vector: Vector) -> tuple[float, Vector]:
@@ -152,5 +205,4 @@ def full_name(namespace: str, topic: str, names: Mapping[str, str]) -> str:
 def _in_frame(vector: Any, frame: str, world: str, heading: float) -> Vector:
     if frame in ("", world):
         return vector.x, vector.y
-    cos, sin = math.cos(heading), math.sin(heading)
-    return cos * vector.x - sin * vector.y, sin * vector.x + cos * vector.y
+    return to_world((vector.x, vector.y), heading)
