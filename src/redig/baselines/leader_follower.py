@@ -2,17 +2,14 @@
 
 from __future__ import annotations
 
-from functools import lru_cache
-
 import torch
 from torch import Tensor
 
 from redig.baselines.episode import EpisodePlanner
 from redig.envs.dynamics import limit_norm
-from redig.envs.map_batch import map_at
 from redig.envs.navigation import FormationNavigation
 from redig.planning.astar import astar
-from redig.planning.plans import planning_grid
+from redig.planning.plans import team_grids
 from redig.planning.tracking import PathTracker, pad_paths
 
 
@@ -74,7 +71,7 @@ class LeaderFollower(EpisodePlanner):
             raise ValueError(f"slowest: got {slowest}, must be in [0, 1]")
         self.leader, self.speed, self.gain, self.patience, self.slowest = leader, speed, gain, patience, slowest
         self.turning, self.clearance = turning, clearance
-        self.grid_of = lru_cache(maxsize=None)(lambda team_map: planning_grid(team_map, scenario.radius))
+        self.grid_of = team_grids(scenario)
         self._paths: list[Tensor] = []
 
     def begin(self, teams: Tensor, position: Tensor, goal: Tensor, num_teams: int) -> None:
@@ -88,7 +85,7 @@ class LeaderFollower(EpisodePlanner):
         self.goal[teams], self.pace[teams] = goal[:, self.leader], 1.0
         starts, ends = position[:, self.leader].tolist(), goal[:, self.leader].tolist()
         for team, start, end in zip(teams.tolist(), starts, ends, strict=True):
-            self._paths[team] = astar(self.grid_of(map_at(self.scenario.obstacle_map, team)), start, end)
+            self._paths[team] = astar(self.grid_of(team), start, end)
         paths = pad_paths(self._paths).to(position.device)
         speed = torch.full((num_teams,), self.speed, device=position.device)
         self._tracker = PathTracker(paths, speed, self.scenario.max_acceleration, self.scenario.dt)

@@ -2,16 +2,13 @@
 
 from __future__ import annotations
 
-from functools import lru_cache
-
 import torch
 from torch import Tensor
 
 from redig.baselines.episode import EpisodePlanner
-from redig.envs.map_batch import map_at
 from redig.envs.navigation import FormationNavigation
 from redig.planning.astar import astar
-from redig.planning.plans import planning_grid
+from redig.planning.plans import team_grids
 from redig.planning.tracking import PathTracker, pad_paths
 
 
@@ -37,7 +34,7 @@ class UncoordinatedPlanner(EpisodePlanner):
         if not 0 < speed <= scenario.max_speed:
             raise ValueError(f"speed: got {speed}, must satisfy 0 < speed <= max_speed = {scenario.max_speed} m/s")
         self.speed = speed
-        self.grid_of = lru_cache(maxsize=None)(lambda team_map: planning_grid(team_map, scenario.radius))
+        self.grid_of = team_grids(scenario)
         self._plans: list[Tensor] = []
 
     def begin(self, teams: Tensor, position: Tensor, goal: Tensor, num_teams: int) -> None:
@@ -46,7 +43,7 @@ class UncoordinatedPlanner(EpisodePlanner):
         if len(self._plans) != num_teams * n:
             self._plans = [position.new_empty(0)] * num_teams * n
         for team, starts, ends in zip(teams.tolist(), position.tolist(), goal.tolist(), strict=True):
-            grid = self.grid_of(map_at(self.scenario.obstacle_map, team))
+            grid = self.grid_of(team)
             self._plans[team * n : (team + 1) * n] = [astar(grid, a, b) for a, b in zip(starts, ends, strict=True)]
         paths = pad_paths(self._plans).to(position.device).unflatten(0, (num_teams, n))
         speed = torch.full(paths.shape[:2], self.speed, device=position.device)

@@ -2,17 +2,12 @@
 
 from __future__ import annotations
 
-from functools import lru_cache
-
 from torch import Tensor
 
 from redig.baselines.episode import EpisodePlanner
-from redig.envs.map_batch import map_at
-from redig.envs.maps import ObstacleMap
 from redig.envs.navigation import FormationNavigation
-from redig.envs.occupancy import OccupancyMap
+from redig.planning.plans import team_structures
 from redig.planning.tracking import ReferenceTracker, pad_references
-from redig.planning.virtual_structure import StructurePlanner
 
 
 class VirtualStructure(EpisodePlanner):
@@ -42,13 +37,8 @@ class VirtualStructure(EpisodePlanner):
         self.max_speed = scenario.max_speed if max_speed is None else max_speed
         if not 0 < self.max_speed <= scenario.max_speed:
             raise ValueError(f"max_speed: got {max_speed}, must be greater than 0 and at most {scenario.max_speed} m/s")
-
-        def structure(team_map: ObstacleMap | OccupancyMap) -> StructurePlanner:
-            offsets = scenario.offsets.cpu()
-            return StructurePlanner(team_map.to("cpu"), scenario.formation, offsets, scenario.radius, **options)
-
-        structure(map_at(scenario.obstacle_map, 0))  # checks the options now rather than in an episode
-        self.structure_of = lru_cache(maxsize=None)(structure)
+        self.structure_of = team_structures(scenario, **options)
+        self.structure_of(0)  # checks the options now rather than in an episode
         self._plans: list[Tensor] = []
 
     def begin(self, teams: Tensor, position: Tensor, goal: Tensor, num_teams: int) -> None:
@@ -57,7 +47,7 @@ class VirtualStructure(EpisodePlanner):
         if len(self._plans) != num_teams:
             self._plans = [position.new_empty(0)] * num_teams
         for team, start, end in zip(teams.tolist(), position.cpu(), goal.cpu(), strict=True):
-            self._plans[team] = self.structure_of(map_at(self.scenario.obstacle_map, team))(start, end, *limits)
+            self._plans[team] = self.structure_of(team)(start, end, *limits)
         self._tracker = ReferenceTracker(pad_references(self._plans).to(position.device), self.scenario.dt)
 
     def command(self, position: Tensor, velocity: Tensor, step: Tensor) -> Tensor:

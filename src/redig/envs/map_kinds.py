@@ -11,7 +11,7 @@ from itertools import combinations
 
 import torch
 
-from redig.envs.maps import ObstacleMap
+from redig.envs.maps import ObstacleMap, check_positive
 
 Box = tuple[float, float, float, float, float, float]
 Point = tuple[float, float]
@@ -37,7 +37,7 @@ def narrowing(gap: float = 0.9, entrance: float = 2.4, length: float = 3.0, appr
         >>> round(narrowing(gap=0.9, length=3.0).signed_distance(exit).item(), 4)
         0.45
     """
-    _check_positive(gap=gap, entrance=entrance, length=length, approach=approach)
+    check_positive(gap=gap, entrance=entrance, length=length, approach=approach)
     if not entrance > gap:
         raise ValueError(f"entrance: got {entrance}, must be greater than gap = {gap} m")
     slope = math.atan2((entrance - gap) / 2, length)
@@ -74,7 +74,7 @@ def passages(
         >>> len(row.obstacles), row.route[1].tolist()  # two walls, each in two parts; the first passage's entrance
         (4, [-1.5, 0.25])
     """
-    _check_positive(gap=gap, length=length, spacing=spacing, approach=approach)
+    check_positive(gap=gap, length=length, spacing=spacing, approach=approach)
     if count < 1:
         raise ValueError(f"count: got {count}, must be at least 1")
     if not shift >= 0:
@@ -117,7 +117,7 @@ def curve(
         tensor([[-3.1445,  0.0000],
                 [-1.7002, -0.9881]])
     """
-    _check_positive(gap=gap, radius=radius, approach=approach, piece=piece)
+    check_positive(gap=gap, radius=radius, approach=approach, piece=piece)
     if not 0 < abs(turn) <= 3:
         raise ValueError(f"turn: got {turn}, must not be 0 and be within ±3 rad")
     if not radius > gap / 2:
@@ -165,7 +165,7 @@ def bollards(gap: float = 1.0, radius: float = 0.3, approach: float = 1.75) -> O
         >>> bollards(gap=1.0).signed_distance(torch.zeros(2)).item()
         0.5
     """
-    _check_positive(gap=gap, radius=radius, approach=approach)
+    check_positive(gap=gap, radius=radius, approach=approach)
     boxes = [(0.0, side * (gap / 2 + radius), 0.0, 0.0, 0.0, radius) for side in (1, -1)]
     return with_route(boxes, gap, _straight(radius + approach))
 
@@ -202,7 +202,7 @@ def forest(
         (6, True)
     """
     low, high = trunk
-    _check_positive(gap=gap, length=length, breadth=breadth, approach=approach, trunk=low)
+    check_positive(gap=gap, length=length, breadth=breadth, approach=approach, trunk=low)
     if count < 2:
         raise ValueError(f"count: got {count}, must be at least 2")
     if not low <= high < min(length, breadth) / 2:
@@ -246,7 +246,7 @@ def doorway(
         >>> hall.signed_distance(torch.tensor([[0.0, 0.0], [-1.5, 1.5]]))  # in the door, and before it near the wall
         tensor([0.4500, 0.5000])
     """
-    _check_positive(gap=gap, thickness=thickness, hallway=hallway, approach=approach)
+    check_positive(gap=gap, thickness=thickness, hallway=hallway, approach=approach)
     if not gap / 2 + abs(offset) < hallway / 2:
         raise ValueError(f"offset: got {offset}, with which the door of {gap} m is not within {hallway} m of hallway")
     reach, boxes = thickness / 2 + approach, []
@@ -276,9 +276,3 @@ def with_route(boxes: list[Box], gap: float, route: list[Point]) -> ObstacleMap:
     x, y = zip(*route, strict=True)
     bounds = (min(x) - MARGIN, min(y) - MARGIN, max(x) + MARGIN, max(y) + MARGIN)
     return ObstacleMap(torch.tensor(boxes), gap, bounds, torch.tensor(route))
-
-
-def _check_positive(**sizes: float) -> None:
-    for name, value in sizes.items():
-        if not value > 0:
-            raise ValueError(f"{name}: got {value}, must be greater than 0 m")

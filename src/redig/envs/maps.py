@@ -150,12 +150,27 @@ def corridor(width: float = 1.1, length: float = 2.0, angle: float = 0.0, wall: 
         >>> round(corridor(width=1.1).signed_distance(torch.zeros(2)).item(), 4)
         0.55
     """
-    for name, value in (("corridor_width", width), ("corridor_length", length), ("wall", wall)):
-        if not value > 0:
-            raise ValueError(f"{name}: got {value}, must be greater than 0 m")
+    check_positive(corridor_width=width, corridor_length=length, wall=wall)
     offset = (width + wall) / 2
     across = (-math.sin(angle) * offset, math.cos(angle) * offset)
     box = [length / 2, wall / 2, angle, 0.0]
     obstacles = torch.tensor([[*across, *box], [-across[0], -across[1], *box]])
     reach = length / 2 + wall
     return ObstacleMap(obstacles, gap=width, bounds=(-reach, -reach, reach, reach))
+
+
+def check_positive(**sizes: float) -> None:
+    """Check sizes (m) by their names.
+
+    Raises:
+        ValueError: naming the first that is not positive.
+
+    Examples:
+        >>> check_positive(gap=1.1, length=0.0)
+        Traceback (most recent call last):
+        ...
+        ValueError: length: got 0.0, must be greater than 0 m
+    """
+    for name, value in sizes.items():
+        if not value > 0:
+            raise ValueError(f"{name}: got {value}, must be greater than 0 m")

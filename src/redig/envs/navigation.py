@@ -7,13 +7,13 @@ from torch import Tensor
 from vmas.simulator.core import Agent, Sphere, World
 from vmas.simulator.scenario import BaseScenario
 
-from redig.envs import rewards
+from redig.envs import rewards, starts
 from redig.envs.dynamics import VelocityCommand, leave_walls, part_robots
 from redig.envs.formations import formation_offsets, pairwise_distances
 from redig.envs.map_batch import AnyMap, check_map, map_at
 from redig.envs.maps import corridor
 from redig.envs.random_maps import named_map
-from redig.envs.routes import route_poses, turned_along
+from redig.envs.routes import turned_along
 
 FORMATION_REWARDS = ("spring_damper", "spring_damper_bonus", "scaled", "slanted", "none")
 NAVIGATION_REWARDS = ("goal_speed", "progress")
@@ -94,7 +94,9 @@ class FormationNavigation(BaseScenario):
                 )
             )
         batch = (batch_dim, self.n_robots)
-        self.poses, self.ahead = self._start_and_goal(batch_dim, device)
+        self.poses, self.ahead = starts.start_and_goal(
+            self.obstacle_map, self.corridor_angle, self.start_distance, batch_dim, device
+        )
         self.goal = torch.zeros(*batch, 2, device=device)
         self.direction = torch.zeros(batch_dim, 2, device=device)
         self.arrived = torch.zeros(batch, dtype=torch.bool, device=device)
@@ -165,20 +167,14 @@ class FormationNavigation(BaseScenario):
         if kwargs:
             raise TypeError(f"unknown argument(s) of FormationNavigation: {', '.join(sorted(kwargs))}")
 
-    def _start_and_goal(self, batch_dim: int, device: torch.device) -> tuple[list[Tensor], tuple[float, float]]:
-        """Poses of start and goal ``[B, 3]`` and how far ahead of them (m) the formations stand."""
-        if self.obstacle_map.route is not None:
-            return [pose.expand(batch_dim, 3) for pose in route_poses(self.obstacle_map.route)], (0.0, 0.0)
-        centre = torch.tensor([0.0, 0.0, self.corridor_angle], device=device).expand(batch_dim, 3)
-        return [centre, centre], (-self.start_distance, self.start_distance)
-
     def reset_world_at(self, env_index: int | None = None) -> None:
         """Draw new start and goal formations for one environment, or for all."""
         index = slice(None) if env_index is None else slice(env_index, env_index + 1)
-        _, start = self._formation_at(self.poses[0][index], self.ahead[0])
-        goal_heading, goal = self._formation_at(self.poses[1][index], self.ahead[1])
+        shape = self.offsets, self.position_jitter, self.heading_jitter
+        _, start = starts.draw_formation(self.poses[0][index], self.ahead[0], *shape)
+        goal_heading, goal = starts.draw_formation(self.poses[1][index], self.ahead[1], *shape)
         here = self.obstacle_map if env_index is None else map_at(self.obstacle_map, env_index)
-        self._check_places(torch.stack([start, goal]), here)
+        starts.check_places(start, goal, here, self.radius, self.start_distance)
         self.direction[index] = goal_heading
         self.goal[index] = goal
         self.arrived[index] = False
@@ -193,31 +189,6 @@ class FormationNavigation(BaseScenario):
                 torch.zeros_like(agent.state.vel if env_index is None else start[0, i]), batch_index=env_index
             )
         self._quantities = None
-
-    def _check_places(self, places: Tensor, obstacle_map: AnyMap) -> None:
-        """Raise if a start or a goal, ``[2, b, n, 2]``, lies inside a wall."""
-        inside = obstacle_map.signed_distance(places) < self.radius
-        if inside.any():
-            which, env, robot = inside.nonzero()[0].tolist()
-            cause = f"start_distance: with {self.start_distance} m" if obstacle_map.route is None else "route: with it"
-            at = [round(x, 2) for x in places[which, env, robot].tolist()]
-            raise ValueError(
-                f"{cause} the {('start', 'goal')[which]} of robot {robot} lies inside a wall, at {at} m; choose a "
-                "larger distance or less jitter"
-            )
-
-    def _formation_at(self, pose: Tensor, ahead: float) -> tuple[Tensor, Tensor]:
-        """Headings ``[b, 2]`` and robots' places ``[b, n, 2]`` of randomised formations ahead of poses ``[b, 3]``."""
-        centre, heading = pose[:, :2], pose[:, 2:]
-        axis = torch.cat([heading.cos(), heading.sin()], -1)
-        along = ahead + self.position_jitter * (2 * torch.rand_like(heading) - 1)
-        across = self.position_jitter * (2 * torch.rand_like(heading) - 1)
-        centre = centre + along * axis + across * torch.stack([-axis[:, 1], axis[:, 0]], -1)
-        heading = heading + self.heading_jitter * (2 * torch.rand_like(heading) - 1)
-        cos, sin = heading.cos(), heading.sin()
-        forward, left = self.offsets.unbind(-1)
-        place = torch.stack([cos * forward - sin * left, sin * forward + cos * left], -1)
-        return torch.cat([cos, sin], -1), centre.unsqueeze(1) + place
 
     def process_action(self, agent: Agent) -> None:
         """A robot that has arrived holds: its command steers it to its goal."""

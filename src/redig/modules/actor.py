@@ -10,7 +10,7 @@ from tensordict import TensorDictBase, unravel_key, unravel_key_list
 from tensordict.nn import TensorDictModule, dispatch, set_skip_existing
 from tensordict.utils import NestedKey
 from torch import nn
-from torchrl.data import Bounded, Composite, TensorSpec, Unbounded
+from torchrl.data import Composite, TensorSpec, Unbounded
 from torchrl.envs import Compose, TensorDictPrimer
 
 from redig.modules.bounded import action_bounds
@@ -116,8 +116,7 @@ class DiffusionActor(TensorDictModule):
             >>> actor.spec["agents", "action"].shape
             torch.Size([5, 2])
         """
-        low, high = (bound.expand(self.action_shape) for bound in (self.module.low, self.module.high))
-        return Composite({self.action_key: Bounded(low, high, self.action_shape, low.device, low.dtype)})
+        return self.module.spec(self.action_key, self.action_shape)
 
     @dispatch(auto_batch_size=False)
     @set_skip_existing(None)

@@ -8,7 +8,7 @@ from typing import TypeVar
 import torch
 from tensordict.utils import NestedKey
 from torch import Tensor, nn
-from torchrl.data import Composite, TensorSpec
+from torchrl.data import Bounded, Composite, TensorSpec
 
 from redig.modules.schedule import keep_precision
 
@@ -49,6 +49,11 @@ class BoundedPolicy(nn.Module):
         """From [-1, 1] to the bounds; what lies outside is clamped."""
         action = self.low + (action + 1) * (self.high - self.low) / 2
         return action.maximum(self.low).minimum(self.high)
+
+    def spec(self, key: NestedKey, shape: torch.Size) -> Composite:
+        """Spec of an action of ``shape`` ``[*n, A]`` under its key, on the policy's device."""
+        low, high = self.low.expand(shape), self.high.expand(shape)
+        return Composite({key: Bounded(low, high, shape, low.device, low.dtype)})
 
     def check_action(self, action: Tensor, *embedding: Tensor) -> None:
         """Check that given actions fit the bounds and the embeddings.

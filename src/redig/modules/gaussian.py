@@ -8,7 +8,7 @@ import torch
 from tensordict.nn import TensorDictModule
 from tensordict.utils import NestedKey
 from torch import Tensor, nn
-from torchrl.data import Bounded, Composite, TensorSpec
+from torchrl.data import Composite, TensorSpec
 from torchrl.envs.utils import ExplorationType, exploration_type
 
 from redig.modules.bounded import BoundedPolicy, action_bounds
@@ -84,6 +84,7 @@ class GaussianActor(TensorDictModule):
     Examples:
         >>> import torch
         >>> from tensordict import TensorDict
+        >>> from torchrl.data import Bounded
         >>> from redig.modules.denoiser import mlp
         >>> actor = GaussianActor(mlp(64, (128,), 4), Bounded(-1, 1, (5, 2)), ["embedding"], ["action"])
         >>> actor(TensorDict({"embedding": torch.randn(8, 5, 64)}, [8]))["action"].shape
@@ -109,5 +110,4 @@ class GaussianActor(TensorDictModule):
     @property
     def spec(self) -> Composite:
         """Spec of the action of one environment, on the actor's device."""
-        low, high = (bound.expand(self.action_shape) for bound in (self.module.low, self.module.high))
-        return Composite({self.out_keys[0]: Bounded(low, high, self.action_shape, low.device, low.dtype)})
+        return self.module.spec(self.out_keys[0], self.action_shape)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Callable
-from functools import lru_cache
+from functools import lru_cache, partial
 
 import torch
 from torch import Tensor
@@ -33,6 +33,41 @@ def planning_grid(obstacle_map: ObstacleMap | OccupancyMap, radius: float) -> Oc
     room = obstacle_map.gap / 2 - radius
     clearance = min(0.15, room / 2)
     return occupancy_grid(obstacle_map, resolution=min(0.1, room - clearance), inflation=radius + clearance)
+
+
+def team_grids(scenario: FormationNavigation) -> Callable[[int], OccupancyGrid]:
+    """The grid that each team's robots plan on, by its number; one is made for each map.
+
+    Examples:
+        >>> from redig.envs import make_env
+        >>> grid_of = team_grids(make_env(2).scenario)
+        >>> grid_of(0) is grid_of(1)  # on one map
+        True
+    """
+    grid = lru_cache(maxsize=None)(partial(planning_grid, radius=scenario.radius))
+    return lambda team: grid(map_at(scenario.obstacle_map, team))
+
+
+def team_structures(scenario: FormationNavigation, **options: float) -> Callable[[int], StructurePlanner]:
+    """The virtual structure of each team, by its number; one is made for each map.
+
+    Args:
+        scenario: formation, robots and map.
+        options: of :class:`~redig.planning.virtual_structure.StructurePlanner`.
+
+    Examples:
+        >>> from redig.envs import make_env
+        >>> structure_of = team_structures(make_env(2).scenario, clearance=0.05)
+        >>> structure_of(0) is structure_of(1)  # on one map
+        True
+    """
+
+    def structure(team_map: ObstacleMap | OccupancyMap) -> StructurePlanner:
+        offsets = scenario.offsets.cpu()
+        return StructurePlanner(team_map.to("cpu"), scenario.formation, offsets, scenario.radius, **options)
+
+    cached = lru_cache(maxsize=None)(structure)
+    return lambda team: cached(map_at(scenario.obstacle_map, team))
 
 
 def plan_alone(
@@ -70,11 +105,11 @@ def plan_alone(
         >>> tracker(start).shape
         torch.Size([2, 3, 2])
     """
-    grid_of = lru_cache(maxsize=None)(lambda team_map: planning_grid(team_map, scenario.radius))
+    grid_of = team_grids(scenario)
     num_envs, n = start.shape[:2]
     paths = []
     for i, (a, b) in enumerate(zip(start.flatten(0, 1).tolist(), goal.flatten(0, 1).tolist(), strict=True)):
-        grid = grid_of(map_at(scenario.obstacle_map, i // n))
+        grid = grid_of(i // n)
         paths.append(astar(grid, a, b) if planner == "astar" else rrt(grid, a, b, seed=seed + i))
         if (i + 1) % n == 0:
             report(i // n)
@@ -104,16 +139,11 @@ def plan_together(
         >>> tracker(start).shape
         torch.Size([2, 3, 2])
     """
-    structure_of = lru_cache(maxsize=None)(
-        lambda team_map: StructurePlanner(
-            team_map.to("cpu"), scenario.formation, scenario.offsets.cpu(), scenario.radius, CLEARANCE
-        )
-    )
+    structure_of = team_structures(scenario, clearance=CLEARANCE)
     team_speed = torch.empty(len(start), device=start.device).uniform_(*speed, generator=generator)
     references = []
     for i, (a, b, limit) in enumerate(zip(start.cpu(), goal.cpu(), team_speed.tolist(), strict=True)):
-        structure = structure_of(map_at(scenario.obstacle_map, i))
-        references.append(structure(a, b, limit, scenario.max_acceleration, scenario.dt))
+        references.append(structure_of(i)(a, b, limit, scenario.max_acceleration, scenario.dt))
         report(i)
     tracker = ReferenceTracker(pad_references(references).to(start.device), scenario.dt)
     steps = itertools.count()
