@@ -82,6 +82,14 @@ class Task:
     reward_scale: float = 0.1
     """Scale of the reward (paper: 0.01)."""
 
+    # what robots hear of each other
+    encoder: str = "edgeconv"
+    """edgeconv, or linear as printed in the paper."""
+    edge_features: str = "state"
+    """What a message says of the difference between two robots: all of their state, or position only."""
+    radius: float = 2.0
+    """Communication range (m)."""
+
     # evaluation
     evaluation_interval: int = 200
     """Steps of all teams between evaluations and checkpoints."""
@@ -102,6 +110,18 @@ class Task:
         if self.map != "corridor":
             arguments["obstacle_map"] = f"{self.map}:{split}" if self.map in MAP_KINDS else self.map
         return arguments
+
+    def ends_of_policy(self, observation_dim: int) -> dict[str, Any]:
+        """What every policy of the task has: the encoder that its observations go into, and the bounds of commands."""
+        return {
+            "observation_dim": observation_dim,
+            "action_low": (-self.max_speed,) * 2,
+            "action_high": (self.max_speed,) * 2,
+            "encoder": self.encoder,
+            "encoder_activation": "relu" if self.encoder == "edgeconv" else None,
+            "edge_features": self.edge_features,
+            "radius": self.radius,
+        }
 
     def saved(self) -> Self:
         """The configuration of the run in the folder to resume.
@@ -216,12 +236,6 @@ class Config(Task):
     # networks and sampling
     actor: str = "diffusion"
     """diffusion; or gaussian or deterministic, trained in exactly the same way, to compare with."""
-    encoder: str = "edgeconv"
-    """edgeconv, or linear as printed in the paper."""
-    edge_features: str = "state"
-    """What a message says of the difference between two robots: all of their state, or position only."""
-    radius: float = 2.0
-    """Communication range (m)."""
     hidden: int = 128
     """Width of the three hidden layers of denoiser and critics (paper: 256)."""
     activation: str = "mish"

@@ -112,17 +112,12 @@ def load(arguments: Arguments, observation_dim: int) -> TensorDictSequential:
     config, _ = read_header(arguments.policy)
     given = {name: getattr(arguments, name) for name in ("sampler", "sampling_steps", "eta", "noise_ratio")}
     given = {name: value for name, value in given.items() if value is not None}
-    if config.kind != "diffusion":
-        if given:
-            raise ValueError(f"{', '.join(given)}: {arguments.policy} holds a {config.kind} policy, which has no chain")
-        return load_policy(
-            arguments.policy,
-            observation_dim,
-            fixed_latent=arguments.fixed_latent,
-            warm_start=arguments.warm_start,
-        )
-    config = replace(config, **given)
-    sampler = build_sampler(config.sampler, config.sampling_steps, config.noise_ratio, config.early_stop, config.eta)
+    sampler = None
+    if config.kind == "diffusion":
+        c = replace(config, **given)
+        sampler = build_sampler(c.sampler, c.sampling_steps, c.noise_ratio, c.early_stop, c.eta)
+    elif given:
+        raise ValueError(f"{', '.join(given)}: {arguments.policy} holds a {config.kind} policy, which has no chain")
     return load_policy(
         arguments.policy,
         observation_dim,
@@ -155,14 +150,17 @@ def load_critics(folder: Path) -> Callable[[TensorDictBase], Tensor]:
     return loss.value
 
 
-def draw_crossing(folder: Path, policy: TensorDictModuleBase, env: TransformedEnv, seed: int) -> None:
-    """One crossing of the only team in ``env`` as a figure and as an animation."""
+def draw_crossing(
+    folder: Path, policy: TensorDictModuleBase, env: TransformedEnv, seed: int, name: str = "trajectories.gif"
+) -> None:
+    """One crossing of the only team in ``env`` as an animation of this name, and as a figure beside it."""
     rollout = rollout_trajectories(policy, env, seed)
     position = rollout["position"][0, rollout["mask"][0]]
     world = env.base_env.scenario
     here = map_at(world.obstacle_map, 0)
-    plot_trajectories(folder / "trajectories.png", position, world.formation, here, world.goal[0])
-    animate(folder / "trajectories.gif", position, world.formation, here, world.goal[0])
+    film = folder / name
+    plot_trajectories(film.with_suffix(".png"), position, world.formation, here, world.goal[0])
+    animate(film, position, world.formation, here, world.goal[0])
 
 
 if __name__ == "__main__":

@@ -11,14 +11,14 @@ from pathlib import Path
 import torch
 import tyro
 from matplotlib.figure import Figure
-from matplotlib.patches import Circle
 
 from redig.envs import EVALUATION_MAPS, MAP_KINDS, make_env
 from redig.envs.map_batch import map_at
 from redig.evaluation import evaluate
 from redig.files import replacing, write_csv
 from redig.policy import load_policy, read_header
-from redig.viz.scene import INK, SHAPE, draw_map, formation_outline, robot_style
+from redig.viz.scene import INK, draw_map, formation_outline
+from redig.viz.team import draw_formation
 
 SHOWN = (
     "success_rate",
@@ -69,10 +69,7 @@ def draw(path: Path, map_seed: int) -> None:
         if here.route is not None:
             axes.plot(*here.route.T, color=INK, linewidth=0.8, linestyle=":")
         for team, filled in ((start, True), (world.goal[-1], False)):
-            axes.plot(*team[formation_outline("wedge", 5)].T, color=SHAPE, linewidth=0.9)
-            for i, place in enumerate(team.tolist()):
-                colour, _ = robot_style(i)
-                axes.add_patch(Circle(place, 0.1, facecolor=colour if filled else "white", edgecolor=colour, zorder=4))
+            draw_formation(axes, team.numpy(), formation_outline("wedge", 5), world.radius, filled)
         axes.set_title(f"{kind}, gap {here.gap:.2f} m", size=9, loc="left")
     for unused in panels:
         unused.set_axis_off()

@@ -10,6 +10,7 @@ from typing import Any, Literal
 import imageio.v2 as imageio
 import mujoco
 import tyro
+from evaluate import draw_crossing
 from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModuleBase
 from torch import Tensor
@@ -19,7 +20,6 @@ from redig.evaluation import rollout_trajectories, team_metrics
 from redig.files import replacing, write_csv
 from redig.physics import Ground, PhysicsNavigation, RobotBody
 from redig.policy import load_policy, read_header
-from redig.viz import animate, plot_trajectories
 
 SHOWN = (
     "success_rate", "team_success_rate", "travel_time", "cfi_0.5", "cfi_0.1", "cfi_0.03", "jerk_mean", "collision_rate",
@@ -147,11 +147,7 @@ def main(arguments: Arguments) -> list[dict[str, Any]]:
         film(arguments.out / f"{formation}.mp4", policy, scenario, arguments.seed)
     elif arguments.film == "plan":
         env = make_env(1, scenario=PhysicsNavigation(), **scenario)
-        crossing = rollout_trajectories(policy, env, arguments.seed)
-        position = crossing["position"][0, crossing["mask"][0]]
-        world = env.scenario
-        plot_trajectories(arguments.out / f"{formation}.png", position, formation, world.obstacle_map, world.goal[0])
-        animate(arguments.out / f"{formation}.mp4", position, formation, world.obstacle_map, world.goal[0])
+        draw_crossing(arguments.out, policy, env, arguments.seed, f"{formation}.mp4")
     print(f"written to {arguments.out}")
     return rows
 

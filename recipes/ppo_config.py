@@ -78,12 +78,6 @@ class PPOConfig(Task):
     """Give the value the mean embedding of the whole team."""
 
     # networks
-    encoder: str = "edgeconv"
-    """edgeconv, or linear as printed in the paper."""
-    edge_features: str = "state"
-    """What a message says of the difference between two robots: all of their state, or position only."""
-    radius: float = 2.0
-    """Communication range (m)."""
     message_width: int = 128
     """Width of the messages between robots."""
     hidden: int = 128

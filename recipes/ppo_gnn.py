@@ -8,17 +8,18 @@ option.
 from __future__ import annotations
 
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from functools import partial
 from pathlib import Path
 
 import torch
 import tyro
+from config import Task
 from finish import finish, score
 from ppo_config import PPOConfig
 from redig_wedge import VALIDATION_SEED, learning_rate
 from run import Run, check_logger
-from tensordict import TensorDictBase
+from tensordict import TensorDict, TensorDictBase
 from tensordict.nn import ProbabilisticTensorDictSequential, TensorDictModule
 from torch import Tensor
 from torchrl.collectors import Collector
@@ -35,8 +36,8 @@ from redig.policy import ACTION, OBSERVATION, PolicyConfig, build_encoder, save_
 ARRIVED, ACTIVE, ADVANTAGE = ("agents", "info", "arrived"), ("agents", "active"), ("agents", "advantage")
 
 
-def train(config: PPOConfig) -> dict[str, float]:
-    """Collect, estimate advantages, update; returns the metrics of the policy that it leaves."""
+def train(config: PPOConfig, end: Callable[[Run, Task], dict[str, float]] = finish) -> dict[str, float]:
+    """Collect, estimate advantages, update, and ``end`` with a final evaluation; returns what that returns."""
     config = config.resolve()
     check_logger(config.logger)
     if config.threads is not None:
@@ -51,7 +52,7 @@ def train(config: PPOConfig) -> dict[str, float]:
     optimizer = torch.optim.Adam(loss.parameters(), config.lr, eps=1e-5, fused=True)
     folder = config.resume or config.out or Path("runs") / f"{config.method}-{config.formation}-seed{config.seed}"
     run = Run(folder, config, config.logger, resume=config.resume is not None)
-    demos = demonstrated(config, folder.parent / "demonstrations") if config.clone_updates else None
+    demos = demonstrated(config, folder.parent / "demonstrations") if config.clone_updates else TensorDict()
     env.set_seed(config.seed)  # VMAS has one random state for all environments: seed after the last is built
     collector = Collector(
         env,
@@ -80,7 +81,6 @@ def train(config: PPOConfig) -> dict[str, float]:
 
     # A warm start: the mean action of the demonstrations
     for i in run.loop("clone", config.clone_updates):
-        assert demos is not None
         learning_rate(optimizer, config.clone_lr * (1 - 0.9 * i / config.clone_updates))
         run.step(
             cloning_loss(policy, demos[torch.randint(len(demos), (config.clone_batch,))]), optimizer, 2.0, "loss_pi"
@@ -107,7 +107,7 @@ def train(config: PPOConfig) -> dict[str, float]:
         run.log(run.figures, i + 1, "train/")
         if (i + 1) % interval == 0 or i + 1 == rounds:
             validate("online", (i + 1) * updates)
-    return finish(run, config)
+    return end(run, config)
 
 
 def robot_by_robot(data: TensorDictBase, team_share: float = 0.0) -> TensorDictBase:
@@ -184,14 +184,8 @@ def demonstrated(config: PPOConfig, cache: Path) -> TensorDictBase:
 def policy_architecture(config: PPOConfig, observation_dim: int) -> PolicyConfig:
     """The policy that a configuration describes."""
     return PolicyConfig(
-        observation_dim=observation_dim,
-        action_low=(-config.max_speed,) * 2,
-        action_high=(config.max_speed,) * 2,
+        **config.ends_of_policy(observation_dim),
         encoder_hidden=config.message_width,
-        radius=config.radius,
-        encoder=config.encoder,
-        encoder_activation="relu" if config.encoder == "edgeconv" else None,
-        edge_features=config.edge_features,
         hidden=(config.hidden,) * 2,
         activation=config.activation,
         kind="ppo",

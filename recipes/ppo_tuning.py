@@ -36,8 +36,7 @@ def main(config: PPOConfig, out: Path = OUT) -> list[dict[str, Any]]:
             raise ValueError(f"seed: got {config.seed}, must be at least 10: lower ones are for results")
         name = f"{config.formation}-{config.method}-{config.seed}-{time.strftime('%y%m%d-%H%M%S')}"
         config.out = config.out or out / name
-    ppo_gnn.finish = lambda run, config: {}  # type: ignore[assignment]
-    ppo_gnn.train(config)
+    ppo_gnn.train(config, end=lambda run, config: {})
     rows = [row(folder) for folder in sorted(path.parent for path in out.glob("*/evaluations.csv"))]
     write_csv(out / "trials.csv", rows)
     return rows

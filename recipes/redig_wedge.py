@@ -165,7 +165,7 @@ def make_collector(
     """What collects n-step transitions: this process, or workers on a Ray cluster."""
     if config.ray is not None:
         return RayCollection(
-            partial(make_env, reward_scale=config.reward_scale, **config.scenario()),
+            partial(make_env, reward_scale=config.reward_scale, **config.scenario(), **config.randomisation()),
             policy,
             num_envs=config.num_envs,
             num_steps=config.collect_steps,
@@ -202,13 +202,7 @@ def transitions(data: TensorDictBase, demonstration: bool = False) -> TensorDict
 def policy_architecture(config: Config, observation_dim: int) -> PolicyConfig:
     """The policy that a configuration describes."""
     return PolicyConfig(
-        observation_dim=observation_dim,
-        action_low=(-config.max_speed,) * 2,
-        action_high=(config.max_speed,) * 2,
-        radius=config.radius,
-        encoder=config.encoder,
-        encoder_activation="relu" if config.encoder == "edgeconv" else None,
-        edge_features=config.edge_features,
+        **config.ends_of_policy(observation_dim),
         hidden=(config.hidden,) * 3,
         activation=config.activation,
         diffusion_steps=config.diffusion_steps,
