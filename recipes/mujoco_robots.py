@@ -17,6 +17,7 @@ from robots import Robot, wait_for
 from tensordict import TensorDict
 
 from redig.deploy.dds import DDSWorld
+from redig.deploy.record import Recorder
 from redig.envs.factory import make_env
 from redig.envs.map_batch import map_at
 from redig.envs.navigation import FormationNavigation
@@ -53,7 +54,14 @@ class WheeledRobot(Robot):
         self._command += ["--drive", arguments.drive, "--deadline", str(0.1 / arguments.speed)]
 
 
-def cross(team: LiveTeam, scenario: FormationNavigation, start: int, speed: float, max_steps: int = 200) -> TensorDict:
+def cross(
+    team: LiveTeam,
+    scenario: FormationNavigation,
+    start: int,
+    speed: float,
+    recorder: Recorder | None = None,
+    max_steps: int = 200,
+) -> TensorDict:
     """One start in real time, over ``speed``: a trajectory ``[1, T]`` as of ``rollout_trajectories``, and ``late`` (s).
 
     ``late`` is how far the world was behind its clock at most; then it was slower than it should have been.
@@ -66,6 +74,7 @@ def cross(team: LiveTeam, scenario: FormationNavigation, start: int, speed: floa
     due, late = time.monotonic(), 0.0
     arrived, held = np.zeros(team.world.n_robots, bool), 0
     samples = [(team.world.position, team.world.velocity, arrived, np.zeros_like(arrived))]
+    record(recorder, team)
     while held < scenario.hold_steps and len(samples) <= max_steps:
         collision = np.zeros_like(arrived)
         for _ in range(round(scenario.dt / TICK)):
@@ -78,11 +87,19 @@ def cross(team: LiveTeam, scenario: FormationNavigation, start: int, speed: floa
         arrived = arrived | near
         held = held + 1 if arrived.all() else 0
         samples.append((team.world.position, team.world.velocity, arrived, collision))
+        record(recorder, team)
     keys = ("position", "velocity", "arrived", "collision")
     fields = {k: torch.as_tensor(np.stack(v)[None]) for k, v in zip(keys, zip(*samples, strict=True), strict=True)}
     fields |= {k: fields[k].float() for k in ("position", "velocity")}
     mask = torch.ones(1, len(samples), dtype=torch.bool)
     return TensorDict({**fields, "mask": mask, "late": torch.full_like(mask, late, dtype=torch.float32)}, mask.shape)
+
+
+def record(recorder: Recorder | None, team: LiveTeam) -> None:
+    """Where the robots are, and what they are commanded, into the recording if there is one."""
+    if recorder is not None:
+        for sensed, command in zip(team.sensed(time.time()), team.commands, strict=True):
+            recorder.write(sensed, command)
 
 
 def main(arguments: Arguments) -> dict[str, float]:
@@ -105,8 +122,9 @@ def main(arguments: Arguments) -> dict[str, float]:
             for robot in robots:
                 stack.enter_context(WheeledRobot(arguments, robot, robots))
         wait_for(network, robots, seconds=300.0)
+        recorder = None if arguments.record is None else stack.enter_context(Recorder(arguments.record))
         for start in range(arguments.starts):
-            runs.append(cross(team, scenario, start, arguments.speed))
+            runs.append(cross(team, scenario, start, arguments.speed, recorder))
             print(f"start {start}: {runs[-1]['arrived'][0, -1].sum()} arrived", flush=True)
     network.close()
     teams = [team_metrics(run, scenario) for run in runs]

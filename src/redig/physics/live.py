@@ -101,12 +101,24 @@ class LiveTeam:
 
     def tell(self, now: float) -> None:
         """Say to each robot what it senses, stamped ``now`` (s)."""
+        for sensed in self.sensed(now):
+            self._network.publish(sensed)
+
+    def sensed(self, now: float) -> list[Sensed]:
+        """What each robot senses, stamped ``now`` (s)."""
         position, velocity, heading = self.world.position, self.world.velocity, self.world.heading
         distance, direction = self._map.nearest(torch.as_tensor(position, dtype=torch.float32))
+        team = []
         for i, robot in enumerate(self.robots):
             place, speed, goal, wall = (_pair(x[i]) for x in (position, velocity, self._goal, direction.numpy()))
             state = RobotState(robot, now, place, speed, goal, float(distance[i]), wall)
-            self._network.publish(Sensed(state, float(heading[i])))
+            team.append(Sensed(state, float(heading[i])))
+        return team
+
+    @property
+    def commands(self) -> list[BodyVelocity]:
+        """The commands that the robots carry out, unless they have been silent."""
+        return [BodyVelocity(forward, 0.0, turn) for forward, turn in self._command.tolist()]
 
 
 def _pair(values: NDArray) -> tuple[float, float]:
