@@ -16,6 +16,15 @@ REWARD: dict[str, dict[str, Any]] = {
     "line": {"formation_weight": 1.0, "arrival_bonus": 10.0},
     "circle": {"formation_weight": 2.0, "arrival_bonus": 20.0},
 }
+PAPER: dict[str, Any] = {  # Table 3 and Sec. 3 as printed, as far as the code still has it; docs/paper.md
+    "encoder": "linear", "observe_direction": False, "shared_encoder": True, "formation_reward": "spring_damper",
+    "formation_weight": 1.0, "omega": 0.5, "navigation_reward": "goal_speed", "arrival_bonus": 15.0,
+    "collision_penalty": 1.5, "proximity_penalty": 0.0, "arrival_terminates": True, "collision_terminates": False,
+    "reward_scale": 0.01, "gamma": 0.99, "n_steps": 1, "block": 1, "tau": 0.005, "critic_lr": 3e-4, "final_lr": 1.0,
+    "hidden": 256, "layer_norm": False, "critic_activation": "mish", "act_with_target": False, "noise_ratio": 1.0,
+    "sampling_steps": 100, "refine_from": "policy", "refine_max_norm": None, "exploration_noise": 0.0,
+    "warmup_noise": 0.0, "demonstration_share": 0.9, "final_share": 0.3, "share_steps": 3200,
+}  # fmt: skip
 SMOKE: dict[str, Any] = {  # the whole program in under a minute; it learns nothing
     "num_trajectories": 100, "clone_updates": 20, "critic_updates": 20, "warmup_steps": 20, "env_steps": 40,
     "evaluation_interval": 20, "evaluation_starts": 8, "num_starts": 8, "num_envs": 8, "hidden": 32,
@@ -62,7 +71,7 @@ class Task:
 
     # the reward
     formation_reward: str = "scaled"
-    """scaled, spring_damper_bonus, spring_damper (Eq. 29) or none."""
+    """scaled, slanted, integrity (tau of the CFI), spring_damper_bonus, spring_damper (Eq. 29) or none."""
     formation_weight: float | None = None
     """Weight of the formation reward against progress in m/s; default: what suits the formation."""
     omega: float = 0.8
@@ -84,7 +93,7 @@ class Task:
 
     # what robots hear of each other
     encoder: str = "edgeconv"
-    """edgeconv, or linear as printed in the paper."""
+    """edgeconv; linear as printed in the paper; or relu, the same with a ReLU behind W^z."""
     edge_features: str = "state"
     """What a message says of the difference between two robots: all of their state, or position only."""
     radius: float = 2.0
@@ -117,8 +126,8 @@ class Task:
             "observation_dim": observation_dim,
             "action_low": (-self.max_speed,) * 2,
             "action_high": (self.max_speed,) * 2,
-            "encoder": self.encoder,
-            "encoder_activation": "relu" if self.encoder == "edgeconv" else None,
+            "encoder": "linear" if self.encoder == "relu" else self.encoder,
+            "encoder_activation": None if self.encoder == "linear" else "relu",
             "edge_features": self.edge_features,
             "radius": self.radius,
         }
@@ -152,6 +161,10 @@ class Config(Task):
     its plain recipe does not survive online training; docs/paper.md says what and why.
     """
 
+    paper: bool = False
+    """The method as printed, as far as the code still has it: sets all options that docs/paper.md names for it, over
+    what the command line gives for them."""
+
     # what differs from robot to robot and from step to step in training and validation, not in demonstrations
     action_delay: tuple[int, int] = (0, 0)
     """Smallest and largest delay of commands (steps), drawn for each team and episode."""
@@ -165,6 +178,8 @@ class Config(Task):
     """Trajectories of single robots, planned without coordination unless planner says otherwise."""
     planner: str = "astar"
     """astar, rrt, or virtual_structure: teams that are coordinated by one plan."""
+    demonstration_speed: tuple[float, float] = (0.5, 1.0)
+    """Lowest and highest speed of a demonstrating robot, or coordinated team (m/s)."""
     clone_updates: int = 3000
     """Updates of the diffusion loss on demonstrations before online training."""
     clone_batch: int = 128
@@ -283,8 +298,8 @@ class Config(Task):
         """
         if self.resume is not None:
             return self.saved()
-        config = dataclasses.replace(self, **SMOKE) if self.smoke else self
-        config = config.filled(REWARD.get(config.formation, REWARD["wedge"]))
+        preset = (PAPER if self.paper else {}) | (SMOKE if self.smoke else {})
+        config = dataclasses.replace(self, **preset).filled(REWARD.get(self.formation, REWARD["wedge"]))
         config.check_positive(
             "num_trajectories", "clone_updates", "clone_batch", "num_envs", "collect_steps", "updates_per_step",
             "batch_size", "buffer_size", "evaluation_interval", "evaluation_starts", "num_starts", "hidden",

@@ -67,7 +67,9 @@ def train(config: Config) -> dict[str, float]:
     multi_step = MultiStep(config.n_steps, config.gamma, keep=[OBSERVATION, ACTION, BASE_ACTION, ARRIVED])
     demo_env = make_env(min(250, config.num_trajectories), reward_scale=config.reward_scale, **scenario)
     cache = folder.parent / "demonstrations"
-    episodes = demonstrations(demo_env, config.num_trajectories, config.planner, seed=config.seed, cache_dir=cache)
+    episodes = demonstrations(
+        demo_env, config.num_trajectories, config.planner, config.demonstration_speed, seed=config.seed, cache_dir=cache
+    )
     demos = transitions(multi_step(episodes)[episodes["mask"]], demonstration=True)
     on_disk = config.buffer_on_disk
     storage = DiskStorage(config.buffer_size, folder / "buffer") if on_disk else LazyTensorStorage(config.buffer_size)

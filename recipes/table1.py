@@ -15,6 +15,7 @@ import subprocess
 import sys
 import threading
 import time
+from collections.abc import Mapping
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
@@ -23,7 +24,7 @@ from typing import IO, Any
 import torch
 import tyro
 from finish import TEST_SEED
-from table1_methods import METHODS, Job, jobs, load
+from table1_methods import METHODS, Job, Method, jobs, load
 from table1_report import write_report
 from tqdm import tqdm
 
@@ -58,15 +59,15 @@ class Arguments:
     """Options passed on to every training recipe, in one string, such as --options="--smoke"."""
 
 
-def main(arguments: Arguments) -> int:
-    """Do what is missing and write the table; returns 1 if a run failed, else 0."""
+def main(arguments: Arguments, methods: Mapping[str, Method] = METHODS, script: str = "recipes/table1.py") -> int:
+    """Do what is missing and write the table of ``methods``; returns 1 if a run failed, else 0."""
     check(arguments)
-    everything = jobs(arguments.formations, arguments.seeds, arguments.runs)
+    everything = jobs(arguments.formations, arguments.seeds, arguments.runs, methods)
     for part in arguments.only:
         if not any(job.matches([part]) for job in everything):
             raise ValueError(
                 f"only: got {part}, must be METHOD, METHOD:FORMATION or METHOD:FORMATION:SEED (no seed where nothing "
-                f"is trained) with a method of {', '.join(METHODS)} and one of the formations and seeds asked for"
+                f"is trained) with a method of {', '.join(methods)} and one of the formations and seeds asked for"
             )
     wanted = [job for job in everything if job.matches(arguments.only)]
     failed = train_all([job for job in wanted if job.command], arguments) if arguments.train else {}
@@ -79,7 +80,9 @@ def main(arguments: Arguments) -> int:
                 print(f"not trained yet: {job.name}, {job.folder} has no metrics.json or no policy", file=sys.stderr)
         except (OSError, ValueError) as error:
             failed[job] = str(error)
-    print(write_report(arguments.out, [job for job in everything if job.starts_file.exists()], command(arguments)))
+    print(
+        write_report(arguments.out, [job for job in everything if job.starts_file.exists()], command(arguments, script))
+    )
     for job, reason in failed.items():
         print(f"failed: {job.name}, {reason}", file=sys.stderr)
     return 1 if failed else 0
@@ -97,9 +100,9 @@ def check(arguments: Arguments) -> None:
             raise ValueError(f"{name}: got {getattr(arguments, name)}, must be at least 1")
 
 
-def command(arguments: Arguments) -> str:
+def command(arguments: Arguments, script: str) -> str:
     """The command that makes the whole table from nothing."""
-    default, words = Arguments(), ["python", "recipes/table1.py"]
+    default, words = type(arguments)(), ["python", script]
     for name in ("seeds", "formations"):
         if (values := getattr(arguments, name)) != getattr(default, name):
             words += [f"--{name}", *map(str, values)]

@@ -1,10 +1,10 @@
-"""The methods of Table 1: how each is trained, and where its policy is."""
+"""The methods of Table 1 and of the ablations: how each is trained, and where its policy is."""
 
 from __future__ import annotations
 
 import json
 import shlex
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -66,6 +66,40 @@ METHODS: dict[str, Method] = {
     "virtual_structure": Method("virtual structure (centralised)"),
 }
 
+SPRING = ("--formation-reward", "spring_damper_bonus")
+
+
+def changed(title: str, *options: str) -> Method:
+    """The default recipe with these options."""
+    return Method(title, "redig_wedge.py", options)
+
+
+ABLATIONS: dict[str, Method] = {  # rows of recipes/ablations.py: the default recipe with one thing changed
+    **{name: METHODS[name] for name in ("redig", "redig_coordinated", "gaussian", "deterministic")},
+    "paper": changed("the paper, as printed", "--paper"),
+    "diffusion_spring": changed("diffusion, spring-damper bonus", *SPRING),
+    "gaussian_spring": changed("no diffusion, spring-damper bonus", "--actor", "gaussian", *SPRING),
+    "gaussian_none": changed("no diffusion, no formation reward", "--actor", "gaussian", "--formation-reward", "none"),
+    "diffusion_none": changed("diffusion, no formation reward", "--formation-reward", "none"),
+    "encoder_linear": changed("linear encoder, as printed", "--encoder", "linear"),
+    "encoder_relu": changed("linear encoder with ReLU", "--encoder", "relu"),
+    "edges_position": changed("messages of positions only", "--edge-features", "position"),
+    "no_direction": changed("no direction to the obstacle", "--no-observe-direction"),
+    "steps_10": changed("K = 10", "--diffusion-steps", "10"),
+    "steps_1000": changed("K = 1000", "--diffusion-steps", "1000"),
+    "refine_3": changed("three refinement steps of η/3", "--refine-steps", "3", "--refine-step-size", "0.1"),
+    "eta_0.1": changed("η = 0.1", "--refine-step-size", "0.1"),
+    "eta_1": changed("η = 1", "--refine-step-size", "1"),
+    "no_online_demos": changed("no demonstrations online", "--demonstration-share", "0", "--final-share", "0"),
+    "constant_demos": changed("half of batches demonstrations", "--final-share", "0.5"),
+    "no_layer_norm": changed("critics without LayerNorm", "--no-layer-norm"),
+}
+
+
+def find(name: str) -> Method:
+    """A method of the table or of the ablations."""
+    return METHODS[name] if name in METHODS else ABLATIONS[name]
+
 
 @dataclass(frozen=True)
 class Job:
@@ -84,7 +118,7 @@ class Job:
     @property
     def command(self) -> tuple[str, ...]:
         """The recipe and its options; empty for what is not trained."""
-        method = METHODS[self.method]
+        method = find(self.method)
         if method.recipe is None:
             return ()
         return (
@@ -101,12 +135,12 @@ class Job:
     @property
     def policy(self) -> Path | None:
         """The policy file; none for a method that plans."""
-        return None if self.method in PLANNERS else self.folder / METHODS[self.method].file
+        return None if self.method in PLANNERS else self.folder / find(self.method).file
 
     @property
     def starts_file(self) -> Path:
         """The CSV file with the metrics of each start."""
-        return self.folder / f"starts-{Path(METHODS[self.method].file).stem}.csv"
+        return self.folder / f"starts-{Path(find(self.method).file).stem}.csv"
 
     def matches(self, only: Sequence[str]) -> bool:
         """Whether one of METHOD, METHOD:FORMATION, METHOD:FORMATION:SEED names it, or nothing is asked for."""
@@ -153,11 +187,13 @@ class Job:
         return scenario
 
 
-def jobs(formations: Sequence[str], seeds: Sequence[int], runs: Path) -> list[Job]:
-    """All of the table, those first that others need."""
+def jobs(
+    formations: Sequence[str], seeds: Sequence[int], runs: Path, methods: Mapping[str, Method] = METHODS
+) -> list[Job]:
+    """All of a table, those first that others need."""
     found = []
     for formation in formations:
-        for method, what in METHODS.items():
+        for method, what in methods.items():
             for seed in [None] if method in PLANNERS else seeds:
                 suffix = "" if seed is None else f"-seed{seed}"
                 found.append(Job(method, formation, seed, runs / f"{what.of or method}-{formation}{suffix}"))

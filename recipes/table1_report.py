@@ -9,7 +9,7 @@ from pathlib import Path
 
 import numpy as np
 from finish import TEST_SEED
-from table1_methods import METHODS, Job
+from table1_methods import ABLATIONS, METHODS, Job
 
 from redig.files import replacing, write_csv
 
@@ -98,7 +98,7 @@ def formation_table(formation: str, starts: dict[Job, dict[str, np.ndarray]]) ->
     best = fastest(found)
     heads = ["", "seeds", *(head for head, _, _ in COLUMNS.values()), "frames", "minutes"]
     lines = [f"### {formation.capitalize()}", "", f"| {' | '.join(heads)} |", "|" + "---|" * len(heads)]
-    for method, what in METHODS.items():
+    for method, what in {**METHODS, **ABLATIONS}.items():
         if (runs := found.get(method)) is None:
             continue
         cells = []

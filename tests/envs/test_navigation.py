@@ -7,6 +7,7 @@ from torchrl.envs import check_env_specs
 
 from redig.envs import curve, formation_offsets, make_env, pairwise_distances
 from redig.envs.maps import ObstacleMap
+from redig.envs.navigation import FORMATION_REWARDS
 
 PARTS = ("navigation_reward", "formation_reward", "arrival_reward", "collision_reward")
 
@@ -67,7 +68,7 @@ def test_specs_are_what_the_environment_returns(arguments):
     assert env.reset()["agents", "observation"].shape == (2, arguments.get("n_robots", 5), width)
 
 
-@pytest.mark.parametrize("formation_reward", ["spring_damper", "spring_damper_bonus", "scaled", "none"])
+@pytest.mark.parametrize("formation_reward", FORMATION_REWARDS)
 @pytest.mark.parametrize("navigation_reward", ["goal_speed", "progress"])
 def test_the_reward_is_the_sum_of_its_parts(formation_reward, navigation_reward):
     env = make_env(

@@ -131,6 +131,20 @@ def test_a_leaning_line_pays_for_squeeze_and_slant_only(seed, slant, squeeze, an
     assert formation_integrity("line", echelon @ turn).item() == pytest.approx(1, abs=1e-6)
 
 
+@given(st.sampled_from(["line", "wedge", "circle"]), seeds, st.floats(0.2, 1.2), st.floats(-math.pi, math.pi))
+@settings(max_examples=60, deadline=None)
+def test_integrity_pays_tau_less_the_squeeze_wherever_the_team_heads(name, seed, squeeze, angle):
+    offsets = formation_offsets(name, 5).double()
+    noise, _ = random_team(seed, 5, spread=0.05)
+    team = offsets * torch.tensor([1.0, squeeze]).double() + noise
+    turn = torch.tensor([[math.cos(angle), math.sin(angle)], [-math.sin(angle), math.cos(angle)]]).double()
+    found = rewards.integrity_bonus(name, team @ turn - 1.0, offsets, torch.tensor([1.0, 0.0]).double() @ turn)
+    left = (team - team.mean(0))[:, 1]
+    scale = (left @ offsets[:, 1] / offsets[:, 1].square().sum()).clamp(0.3, 1.1).item()
+    expected = formation_integrity(name, team).item() - 0.1 * max(1 - scale, 0)
+    assert found.item() == pytest.approx(expected, abs=1e-6)
+
+
 @given(seeds, st.sampled_from(["line", "wedge", "circle"]))
 @settings(max_examples=40, deadline=None)
 def test_no_slant_of_a_grid_leaves_a_smaller_residual(seed, name):

@@ -15,7 +15,7 @@ from redig.envs.maps import corridor
 from redig.envs.random_maps import named_map
 from redig.envs.routes import turned_along
 
-FORMATION_REWARDS = ("spring_damper", "spring_damper_bonus", "scaled", "slanted", "none")
+FORMATION_REWARDS = ("spring_damper", "spring_damper_bonus", "scaled", "slanted", "integrity", "none")
 NAVIGATION_REWARDS = ("goal_speed", "progress")
 
 
@@ -40,7 +40,7 @@ class FormationNavigation(BaseScenario):
       smallest and largest factor on ``max_acceleration``, drawn for each team at its reset; ``None``: 1.
     * ``observe_direction``: add the unit vector to the nearest obstacle (9 numbers); ``False`` gives the paper's 7.
     * ``formation_reward``: one of ``spring_damper`` (Eq. 29), ``spring_damper_bonus``, ``scaled``, ``slanted``,
-      ``none``; ``formation_weight``; ``omega``. The frame of ``scaled`` and ``slanted`` is the goal formation's
+      ``integrity``, ``none``; ``formation_weight``; ``omega``. The frame of ``scaled`` and ``slanted`` is the goal's
       heading, so that the goal itself is a perfect formation. On a route it is turned back by as much as the route
       turns between the team's centroid and the goal, so that a team is squeezed across the path wherever it is; on a
       straight one that is nothing. The contextual formation integrity has no frame.
@@ -252,6 +252,10 @@ class FormationNavigation(BaseScenario):
             bonus = rewards.scaled_formation_bonus(position, self.offsets, self._travel_direction(position))
         elif self.formation_reward == "slanted":
             bonus = rewards.slanted_formation_bonus(position, self.offsets, self._travel_direction(position))
+        elif self.formation_reward == "integrity":
+            direction = self._travel_direction(position)
+            team = rewards.integrity_bonus(self.formation, position, self.offsets, direction)
+            bonus = team.unsqueeze(-1).expand(-1, self.n_robots)
         elif self.formation_reward == "spring_damper_bonus":
             bonus = rewards.spring_damper_bonus(position, velocity, self.desired, self.omega)
         elif self.formation_reward == "spring_damper":

@@ -9,7 +9,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from redig.envs.formations import pairwise_distances
+from redig.envs.formations import formation_integrity, pairwise_distances
 
 
 def spring_damper(position: Tensor, velocity: Tensor, desired: Tensor, omega: float = 0.5) -> Tensor:
@@ -177,6 +177,36 @@ def slanted_formation_bonus(
     slant = ((forward * offsets[:, 1]).sum(-1) / offsets[:, 1].square().sum()).clamp(-steepest, steepest).unsqueeze(-1)
     upright = position - (slant * offsets[:, 1]).unsqueeze(-1) * direction.unsqueeze(-2)
     return scaled_formation_bonus(upright, offsets, direction) - slant_cost * slant.abs()
+
+
+def integrity_bonus(
+    name: str, position: Tensor, offsets: Tensor, direction: Tensor, squeeze_cost: float = 0.1
+) -> Tensor:
+    """Tau of the contextual formation integrity, the measure of the evaluation, as a reward of the team.
+
+    ``tau - squeeze_cost * max(1 - s, 0)`` with the lateral scale s of :func:`best_lateral_scale`. Whatever keeps the
+    proportions is as good as any other: a circle that is squeezed and stretched, a line that leans.
+
+    Args:
+        name: of the formation, see :func:`redig.envs.formations.formation_integrity`.
+        position: ``[*B, n, 2]`` (m).
+        offsets: the formation ``[n, 2]`` (m).
+        direction: unit vector of travel ``[*B, 2]``.
+        squeeze_cost: price of a formation squeezed to nothing; it makes the team spread again behind the corridor.
+
+    Returns:
+        reward ``[*B]``, at most 1, the same for every robot of the team.
+
+    Examples:
+        >>> import torch
+        >>> from redig.envs.formations import formation_offsets
+        >>> line = formation_offsets("line", 5)
+        >>> echelon = torch.stack([0.5 * line[:, 1], 0.8 * line[:, 1]], -1)  # it leans, and is less broad
+        >>> integrity_bonus("line", echelon, line, torch.tensor([1.0, 0.0])).round(decimals=4)
+        tensor(0.9800)
+    """
+    scale, _ = best_lateral_scale(position, offsets, direction)
+    return formation_integrity(name, position) - squeeze_cost * (1 - scale).clamp_min(0)
 
 
 def goal_speed(position: Tensor, velocity: Tensor, goal: Tensor) -> Tensor:

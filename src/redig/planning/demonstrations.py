@@ -23,7 +23,7 @@ from redig.files import replacing
 from redig.planning.plans import plan_alone, plan_together
 
 PLANNERS = ("astar", "rrt", "virtual_structure")
-VERSION = 3  # part of the cache's hash: raise it whenever this package would make different demonstrations
+VERSION = 4  # part of the cache's hash: raise it whenever this package would make different demonstrations
 KEYS = (
     ("agents", "observation"),
     ("agents", "action"),
