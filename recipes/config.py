@@ -25,6 +25,11 @@ PAPER: dict[str, Any] = {  # Table 3 and Sec. 3 as printed, as far as the code s
     "sampling_steps": 100, "refine_from": "policy", "refine_max_norm": None, "exploration_noise": 0.0,
     "warmup_noise": 0.0, "demonstration_share": 0.9, "final_share": 0.3, "share_steps": 3200,
 }  # fmt: skip
+COORDINATED: dict[str, Any] = {  # what suits demonstrations worth keeping to: small steps away from them
+    "planner": "virtual_structure", "demonstration_speed": (1.0, 1.0), "formation_reward": "integrity",
+    "formation_weight": 2.0, "arrival_bonus": 20.0, "proximity_penalty": 2.0, "refine_max_norm": 0.05,
+    "final_share": 0.5,
+}  # fmt: skip
 SMOKE: dict[str, Any] = {  # the whole program in under a minute; it learns nothing
     "num_trajectories": 100, "clone_updates": 20, "critic_updates": 20, "warmup_steps": 20, "env_steps": 40,
     "evaluation_interval": 20, "evaluation_starts": 8, "num_starts": 8, "num_envs": 8, "hidden": 32,
@@ -165,6 +170,9 @@ class Config(Task):
     """The method as printed, as far as the code still has it: sets all options that docs/paper.md names for it, over
     what the command line gives for them."""
 
+    coordinated: bool = False
+    """Demonstrations of one plan for the team instead of one a robot, and what suits them (recipes/config.py)."""
+
     # what differs from robot to robot and from step to step in training and validation, not in demonstrations
     action_delay: tuple[int, int] = (0, 0)
     """Smallest and largest delay of commands (steps), drawn for each team and episode."""
@@ -298,7 +306,9 @@ class Config(Task):
         """
         if self.resume is not None:
             return self.saved()
-        preset = (PAPER if self.paper else {}) | (SMOKE if self.smoke else {})
+        if self.paper and self.coordinated:
+            raise ValueError("paper: its robots are not coordinated by one plan, so not with coordinated")
+        preset = (PAPER if self.paper else COORDINATED if self.coordinated else {}) | (SMOKE if self.smoke else {})
         config = dataclasses.replace(self, **preset).filled(REWARD.get(self.formation, REWARD["wedge"]))
         config.check_positive(
             "num_trajectories", "clone_updates", "clone_batch", "num_envs", "collect_steps", "updates_per_step",

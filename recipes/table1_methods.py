@@ -56,12 +56,13 @@ METHODS: dict[str, Method] = {
             "3e-4",
         ),
     ),
-    "redig_coordinated": Method(
-        "ReDiG, coordinated demonstrations", "redig_wedge.py", ("--planner", "virtual_structure")
-    ),
+    "redig_coordinated": Method("ReDiG, coordinated demonstrations", "redig_wedge.py", ("--coordinated",)),
     "gaussian": Method("Gaussian actor, trained as ReDiG", "redig_wedge.py", ("--actor", "gaussian")),
     "deterministic": Method("deterministic actor, trained as ReDiG", "redig_wedge.py", ("--actor", "deterministic")),
     "cloned": Method("ReDiG before online training", of="redig", file="cloned.safetensors"),
+    "cloned_coordinated": Method(
+        "ReDiG, coordinated, before online training", of="redig_coordinated", file="cloned.safetensors"
+    ),
     "uncoordinated": Method("planners without coordination"),
     "virtual_structure": Method("virtual structure (centralised)"),
 }

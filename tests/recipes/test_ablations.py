@@ -6,7 +6,7 @@ import redig_wedge
 import table1
 import tyro
 from ablations import Arguments
-from config import PAPER, SMOKE, Config
+from config import COORDINATED, PAPER, SMOKE, Config
 from table1_methods import ABLATIONS, METHODS, find, jobs
 from table1_report import write_report
 from test_table1_report import fake_run
@@ -23,7 +23,13 @@ def test_each_is_the_default_recipe_with_what_its_options_say_changed(name):
     fields = [field.name for field in dataclasses.fields(Config)]
     changed = {field for field in fields if getattr(given, field) != getattr(DEFAULT, field)}
     named = {option[2:].replace("-", "_").removeprefix("no_") for option in options if option.startswith("--")}
-    assert changed == (named | PAPER.keys() if name == "paper" else named)
+    preset = {"paper": PAPER, "redig_coordinated": COORDINATED}.get(name, {})
+    assert changed == named | {field for field, value in preset.items() if value != getattr(DEFAULT, field)}
+
+
+def test_presets_exclude_each_other():
+    with pytest.raises(ValueError, match="paper: its robots are not coordinated"):
+        Config(paper=True, coordinated=True).resolve()
 
 
 def test_runs_of_the_table_are_not_made_twice(tmp_path):
