@@ -19,7 +19,7 @@ from redig.planning.rrt import rrt
 from redig.planning.tracking import PathTracker, ReferenceTracker, pad_paths, pad_references
 from redig.planning.virtual_structure import StructurePlanner
 
-CLEARANCE = 0.1  # m, that a virtual structure keeps where its robots are disturbed, and will be imitated
+CLEARANCE = 0.12  # m, that a virtual structure keeps where its robots are disturbed, and will be imitated
 
 
 def planning_grid(obstacle_map: ObstacleMap | OccupancyMap, radius: float) -> OccupancyGrid:
