@@ -87,6 +87,13 @@ def test_a_command_that_is_not_finite_stops_the_robot(live, forward):
     assert team.world.velocity[0, 0] == pytest.approx(0.0, abs=0.02)
 
 
+def test_what_is_recorded_is_what_was_told_and_what_is_carried_out(live):
+    team, network = live
+    run(team, network, (9.0, 0.3, -9.0), 25)
+    assert team.sensed(10.5) == [network.told[name] for name in NAMES]
+    assert team.commands == [BodyVelocity(1.2, 0.0, -6.0), BodyVelocity(0.0, 0.0, 0.0)]
+
+
 def test_a_new_start_forgets_commands(live):
     team, network = live
     run(team, network, (0.5, 0.0, 0.0), 10)
