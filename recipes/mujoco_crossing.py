@@ -104,7 +104,7 @@ def measure(policy: TensorDictModuleBase, env: Any, seed: int) -> dict[str, floa
     for key, value in {**team_metrics(trajectories, env.scenario), **tracking(trajectories)}.items():
         known = value[~value.isnan()].double()
         figures[key] = known.mean().item()
-        figures[f"{key}_sd"] = known.std(correction=0).item()
+        figures[f"{key}_sd"] = known.std(correction=0).item() if len(known) else float("nan")
     return {**figures, "times_real_time": factor}
 
 
