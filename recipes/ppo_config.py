@@ -11,7 +11,7 @@ from config import REWARD, Task
 # What each method is paid for; all else, and what is not given on the command line, is as in the default recipe.
 METHODS: dict[str, dict[str, Any]] = {
     "dgnn": {"formation_reward": "none"},
-    "afor": {"formation_reward": "spring_damper", "formation_weight": 0.05},  # of a sum over all pairs
+    "afor": {"formation_reward": "spring_damper_bonus", "formation_weight": 0.5},  # as printed, nobody arrives
     "afor_redig_reward": {},
 }
 SMOKE: dict[str, Any] = {  # the whole program in under a minute; it learns nothing
@@ -28,7 +28,7 @@ class PPOConfig(Task):
     """dgnn: navigation and collisions only; afor: and the spring-damper reward; afor_redig_reward: the reward of the
     default recipe."""
     formation_reward: str | None = None  # type: ignore[assignment]
-    """scaled, spring_damper_bonus, spring_damper (Eq. 29) or none; default: that of the method."""
+    """As in the default recipe: scaled, spring_damper_bonus, spring_damper (Eq. 29), none, …; default: the method's."""
 
     # a warm start
     clone_updates: int = 0

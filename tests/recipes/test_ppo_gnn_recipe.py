@@ -40,7 +40,7 @@ def test_a_run_leaves_what_the_default_recipe_leaves(smoke_ppo):
     folder, printed = smoke_ppo
     metrics = json.loads((folder / "metrics.json").read_text())
     assert {"success_rate", "cfi_0.5", "cloned_success_rate", "last_jerk_mean"} <= set(metrics)
-    assert json.loads((folder / "config.json").read_text())["formation_reward"] == "spring_damper"
+    assert json.loads((folder / "config.json").read_text())["formation_reward"] == "spring_damper_bonus"
     with open(folder / "evaluations.csv") as file:
         assert [row["phase"] for row in csv.DictReader(file)][:2] == ["clone", "online"]
     for name in ("learning_curve.png", "trajectories.png", "trajectories.gif"):
