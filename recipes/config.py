@@ -171,7 +171,8 @@ class Config(Task):
     what the command line gives for them."""
 
     coordinated: bool = False
-    """Demonstrations of one plan for the team instead of one a robot, and what suits them (recipes/config.py)."""
+    """Demonstrations of one plan for the team instead of one a robot, and what suits them: sets all options of
+    recipes/config.py: COORDINATED, over what the command line gives for them."""
 
     # what differs from robot to robot and from step to step in training and validation, not in demonstrations
     action_delay: tuple[int, int] = (0, 0)

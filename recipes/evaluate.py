@@ -17,6 +17,8 @@ from torchrl.envs.utils import ExplorationType
 from redig.checkpoint import load_checkpoint
 from redig.envs.factory import make_env
 from redig.envs.map_batch import map_at
+from redig.envs.maps import ObstacleMap
+from redig.envs.occupancy import OccupancyMap
 from redig.envs.random_maps import MAP_KINDS
 from redig.evaluation import evaluate, format_table, rollout_trajectories, write_metrics
 from redig.modules import BestOfN, DiffusionActor
@@ -157,10 +159,15 @@ def draw_crossing(
     rollout = rollout_trajectories(policy, env, seed)
     position = rollout["position"][0, rollout["mask"][0]]
     world = env.base_env.scenario
-    here = map_at(world.obstacle_map, 0)
-    film = folder / name
-    plot_trajectories(film.with_suffix(".png"), position, world.formation, here, world.goal[0])
-    animate(film, position, world.formation, here, world.goal[0])
+    draw_team(folder / name, position, world.formation, map_at(world.obstacle_map, 0), world.goal[0])
+
+
+def draw_team(
+    film: Path, position: Tensor, formation: str, obstacle_map: ObstacleMap | OccupancyMap, goal: Tensor
+) -> None:
+    """The way of a team ``[T, n, 2]`` (m) as an animation, and as a figure beside it."""
+    plot_trajectories(film.with_suffix(".png"), position, formation, obstacle_map, goal)
+    animate(film, position, formation, obstacle_map, goal)
 
 
 if __name__ == "__main__":

@@ -12,6 +12,7 @@ from pathlib import Path
 import numpy as np
 import torch
 import tyro
+from evaluate import draw_team
 from robots import Arguments as WorldArguments
 from robots import Robot, wait_for
 from tensordict import TensorDict
@@ -21,12 +22,11 @@ from redig.deploy.record import Recorder
 from redig.envs.factory import make_env
 from redig.envs.map_batch import map_at
 from redig.envs.navigation import FormationNavigation
-from redig.evaluation import format_table, team_metrics, write_metrics
+from redig.evaluation import format_table, mean_metrics, team_metrics, write_metrics
 from redig.physics import PhysicsWorld
 from redig.physics.live import LiveTeam
 from redig.physics.navigation import boxes
 from redig.policy import read_header
-from redig.viz import animate, plot_trajectories
 
 TICK = 0.02  # s of physics between two states
 SILENCE = 2.0  # s before a start, in which robots forget where the others were at the end of the last one
@@ -127,18 +127,15 @@ def main(arguments: Arguments) -> dict[str, float]:
             runs.append(cross(team, scenario, start, arguments.speed, recorder))
             print(f"start {start}: {runs[-1]['arrived'][0, -1].sum()} arrived", flush=True)
     network.close()
-    teams = [team_metrics(run, scenario) for run in runs]
-    metrics = {key: torch.cat([team[key] for team in teams]).nanmean().item() for key in teams[0]}
+    metrics = mean_metrics([team_metrics(run, scenario) for run in runs])
     metrics |= {
-        "num_starts": float(arguments.starts),
         "times_real_time": arguments.speed,
         "late": max(run["late"].max().item() for run in runs),
     }
     print(format_table(metrics))
     write_metrics(arguments.out / "metrics.json", metrics)
-    first, goal = runs[0]["position"][0], scenario.goal[0]
-    for draw, name in ((plot_trajectories, "crossing.png"), (animate, "crossing.mp4")):
-        draw(arguments.out / name, first, scenario.formation, obstacle_map, goal)
+    first = runs[0]["position"][0]
+    draw_team(arguments.out / "crossing.mp4", first, scenario.formation, obstacle_map, scenario.goal[0])
     return metrics
 
 

@@ -10,6 +10,7 @@ from typing import Annotated
 import numpy as np
 import torch
 import tyro
+from evaluate import draw_team
 from numpy.typing import NDArray
 from tensordict import TensorDict
 
@@ -18,10 +19,10 @@ from redig.envs.factory import make_env
 from redig.envs.map_batch import map_at
 from redig.envs.navigation import FormationNavigation
 from redig.envs.rewards import mate_clearance
-from redig.evaluation import format_table, jerk, team_metrics, write_metrics
+from redig.evaluation import format_table, jerk, mean_metrics, team_metrics, write_metrics
 from redig.files import write_csv
 from redig.policy import read_header
-from redig.viz import animate, plot_jerk, plot_trajectories
+from redig.viz import plot_jerk
 
 TOUCH = 1e-3  # m; the simulated worlds move robots that collide just out of contact before they are recorded
 
@@ -54,15 +55,15 @@ def split(run: Run) -> list[slice]:
 
 
 def trajectory(run: Run, samples: slice, scenario: FormationNavigation) -> TensorDict:
-    """One start as :func:`~redig.evaluation.rollout_trajectories` has it, ``[1, T]``."""
+    """One start ``[1, T]`` with what :func:`~redig.evaluation.team_metrics` needs, and the goals."""
     position, goal, obstacle = (_tensor(x[samples]) for x in (run.position, run.goal, run.obstacle))
     mate = mate_clearance(position, scenario.radius)
     collision = (obstacle.norm(dim=-1) < scenario.radius + TOUCH) | (mate < TOUCH)
     near = (goal - position).norm(dim=-1) < scenario.goal_radius
     arrived = near.int().cummax(-2).values.bool()
-    fields = {"position": position, "velocity": _tensor(run.velocity[samples]), "goal": goal, "arrived": arrived}
     mask = torch.ones(len(position), dtype=torch.bool)
-    return TensorDict({**fields, "collision": collision, "mask": mask}, mask.shape).unsqueeze(0)
+    fields = {"position": position, "goal": goal, "arrived": arrived, "collision": collision, "mask": mask}
+    return TensorDict(fields, mask.shape).unsqueeze(0)
 
 
 def check(run: Run, starts: list[slice], scenario: FormationNavigation, arguments: Arguments) -> None:
@@ -92,8 +93,7 @@ def main(arguments: Arguments) -> dict[str, float]:
     rows = [{"start": i, **{key: value.item() for key, value in each.items()}} for i, each in enumerate(figures)]
     arguments.out.mkdir(parents=True, exist_ok=True)
     write_csv(arguments.out / "starts.csv", rows)
-    metrics = {key: torch.cat([each[key] for each in figures]).nanmean().item() for key in figures[0]}
-    metrics["num_starts"] = float(len(teams))
+    metrics = mean_metrics(figures)
     print(format_table(metrics))
     write_metrics(arguments.out / "metrics.json", metrics)
     draw(arguments.out, teams[arguments.start][0], scenario)
@@ -103,12 +103,10 @@ def main(arguments: Arguments) -> dict[str, float]:
 
 def draw(folder: Path, team: TensorDict, scenario: FormationNavigation) -> None:
     """Trajectories, as a figure and as an animation, and the jerk of a team ``[T]``."""
-    what = (team["position"], scenario.formation, map_at(scenario.obstacle_map, 0), team["goal"][0])
-    plot_trajectories(folder / "trajectories.png", *what)
-    animate(folder / "trajectories.mp4", *what)
-    profile = jerk(team["position"], scenario.dt)
-    held = team["arrived"].roll(1, 0)[3:]
-    plot_jerk(folder / "jerk.png", {scenario.formation: profile.masked_fill(held, float("nan"))}, scenario.dt)
+    here = map_at(scenario.obstacle_map, 0)
+    draw_team(folder / "trajectories.mp4", team["position"], scenario.formation, here, team["goal"][0])
+    profile = jerk(team["position"], scenario.dt).masked_fill(team["arrived"][2:-1], torch.nan)
+    plot_jerk(folder / "jerk.png", {scenario.formation: profile}, scenario.dt)
 
 
 def _tensor(values: NDArray) -> torch.Tensor:

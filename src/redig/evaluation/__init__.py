@@ -17,7 +17,7 @@ from redig.evaluation.diffusion_bound import (
     prior_mismatch,
     prior_mismatch_floor,
 )
-from redig.evaluation.evaluate import evaluate, evaluate_teams, rollout_trajectories, team_metrics
+from redig.evaluation.evaluate import evaluate, evaluate_teams, mean_metrics, rollout_trajectories, team_metrics
 from redig.evaluation.message_importance import message_importance
 from redig.evaluation.metrics import (
     contextual_formation_integrity,
@@ -46,6 +46,7 @@ __all__ = [
     "jerk",
     "matching_divergence",
     "matching_error",
+    "mean_metrics",
     "message_importance",
     "prior_mismatch",
     "prior_mismatch_floor",

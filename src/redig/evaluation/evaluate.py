@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 
 import torch
 from tensordict import TensorDict, TensorDictBase
@@ -117,9 +117,23 @@ def evaluate(
         >>> metrics["success_rate"], metrics["num_starts"]  # in so wide a corridor, straight on is good enough
         (1.0, 4.0)
     """
-    teams = evaluate_teams(policy, env, seed, num_starts, max_steps, deltas, exploration_type)
-    metrics = {key: value.nanmean().item() for key, value in teams.items()}
-    return {**metrics, "num_starts": float(len(teams["success_rate"]))}
+    return mean_metrics([evaluate_teams(policy, env, seed, num_starts, max_steps, deltas, exploration_type)])
+
+
+def mean_metrics(teams: Sequence[Mapping[str, Tensor]]) -> dict[str, float]:
+    """What :func:`evaluate` reports of teams: the mean of each metric, NaN left out, and ``num_starts``.
+
+    Args:
+        teams: from :func:`team_metrics` or :func:`evaluate_teams`, one or several; each metric is ``[E]``.
+
+    Examples:
+        >>> rates = [{"travel_time": torch.tensor([7.0, torch.nan])}, {"travel_time": torch.tensor([8.0])}]
+        >>> mean_metrics(rates)
+        {'travel_time': 7.5, 'num_starts': 3.0}
+    """
+    metrics = {key: torch.cat([each[key] for each in teams]) for key in teams[0]}
+    means = {key: value.nanmean().item() for key, value in metrics.items()}
+    return {**means, "num_starts": float(len(next(iter(metrics.values()))))}
 
 
 def evaluate_teams(
