@@ -181,6 +181,9 @@ class Config(Task):
     """Standard deviation of noise on what robots sense (m, m/s)."""
     acceleration_range: tuple[float, float] = (1.0, 1.0)
     """Smallest and largest factor on the acceleration limit, drawn for each team and episode."""
+    turn_gain: tuple[float, float] | None = None
+    """Robots have wheels, and turn towards commands at a rate between these two (1/s), drawn for each team and
+    episode; None: they move in any direction at once."""
 
     # demonstrations and cloning
     num_trajectories: int = 5000
@@ -296,6 +299,7 @@ class Config(Task):
             "action_delay": self.action_delay,
             "observation_noise": self.observation_noise,
             "acceleration_range": self.acceleration_range if scaled else None,
+            "turn_gain": self.turn_gain,
         }
 
     def resolve(self) -> Config:

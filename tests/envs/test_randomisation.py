@@ -90,7 +90,7 @@ def test_acceleration_is_limited_for_each_team():
 
 
 def test_a_collection_resumes_exactly():
-    env = make_env(3, action_delay=(0, 2), acceleration_range=(0.5, 1.0), n_robots=3)
+    env = make_env(3, action_delay=(0, 2), acceleration_range=(0.5, 1.0), turn_gain=(2.0, 8.0), n_robots=3)
     collector = Collector(
         env, random_policy(), frames_per_batch=12, total_frames=-1, auto_register_policy_transforms=False
     )

@@ -10,6 +10,7 @@ from redig.envs.navigation import FormationNavigation
 from redig.envs.occupancy import OccupancyMap, load_occupancy_map
 from redig.envs.random_maps import EVALUATION_MAPS, MAP_KINDS, named_map, random_map
 from redig.envs.randomisation import ActionDelay, ObservationNoise
+from redig.envs.turning import TurningCommand
 
 __all__ = [
     "EVALUATION_MAPS",
@@ -22,6 +23,7 @@ __all__ = [
     "ObservationNoise",
     "ObstacleMap",
     "OccupancyMap",
+    "TurningCommand",
     "bollards",
     "corridor",
     "curve",

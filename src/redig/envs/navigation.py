@@ -8,10 +8,11 @@ from vmas.simulator.core import Agent, Sphere, World
 from vmas.simulator.scenario import BaseScenario
 
 from redig.envs import rewards, starts
-from redig.envs.dynamics import VelocityCommand, leave_walls, part_robots
+from redig.envs.dynamics import leave_walls, part_robots
 from redig.envs.formations import formation_offsets, pairwise_distances
 from redig.envs.map_batch import AnyMap, check_map, map_at
 from redig.envs.maps import corridor
+from redig.envs.motion import Motion
 from redig.envs.random_maps import named_map
 from redig.envs.routes import turned_along
 
@@ -37,7 +38,9 @@ class FormationNavigation(BaseScenario):
       ``corridor_angle``; on a map with a route, its ends say where both are and how they head. ``position_jitter`` (m)
       and ``heading_jitter`` (rad): half ranges of what is added to each.
     * ``radius`` (m), ``max_speed`` (m/s), ``max_acceleration`` (m/s²), ``dt`` (s): the robots. ``acceleration_range``:
-      smallest and largest factor on ``max_acceleration``, drawn for each team at its reset; ``None``: 1.
+      smallest and largest factor on ``max_acceleration``, drawn for each team at its reset; ``None``: 1. ``turn_gain``:
+      slowest and fastest turn towards commands (1/s), drawn likewise, of robots with wheels that start facing their
+      goals, see :class:`~redig.envs.TurningCommand`; ``None``: points that move in any direction at once.
     * ``observe_direction``: add the unit vector to the nearest obstacle (9 numbers); ``False`` gives the paper's 7.
     * ``formation_reward``: one of ``spring_damper`` (Eq. 29), ``spring_damper_bonus``, ``scaled``, ``slanted``,
       ``integrity``, ``none``; ``formation_weight``; ``omega``. The frame of ``scaled`` and ``slanted`` is the goal's
@@ -79,6 +82,8 @@ class FormationNavigation(BaseScenario):
         self.offsets = offsets.to(device)
         self.desired = pairwise_distances(self.offsets)
         self.obstacle_map = self.obstacle_map.to(device)
+        limits = self.dt, self.max_speed, self.max_acceleration, self.acceleration_range, self.turn_gain
+        self.motion = Motion(self.n_robots, batch_dim, device, *limits)
         world = World(batch_dim, device, dt=self.dt, drag=0.0)
         for i in range(self.n_robots):
             world.add_agent(
@@ -88,9 +93,9 @@ class FormationNavigation(BaseScenario):
                     rotatable=False,
                     collide=False,  # contact is resolved against the signed distance, see ``post_step``
                     mass=1.0,
-                    max_f=self.max_acceleration,
+                    max_f=self.motion.max_force,
                     u_range=self.max_speed,
-                    dynamics=VelocityCommand(self.dt, self.max_speed),
+                    dynamics=self.motion.robots[i],
                 )
             )
         batch = (batch_dim, self.n_robots)
@@ -101,10 +106,6 @@ class FormationNavigation(BaseScenario):
         self.direction = torch.zeros(batch_dim, 2, device=device)
         self.arrived = torch.zeros(batch, dtype=torch.bool, device=device)
         self.held = torch.zeros(batch_dim, dtype=torch.long, device=device)
-        self.acceleration = torch.full((batch_dim, 1), float(self.max_acceleration), device=device)
-        if self.acceleration_range is not None:
-            for agent in world.agents:
-                agent.dynamics.acceleration = self.acceleration
         self._quantities: dict[str, Tensor] | None = None
         return world
 
@@ -120,10 +121,7 @@ class FormationNavigation(BaseScenario):
         self.heading_jitter = take("heading_jitter", 0.1)
         self.radius, self.dt = take("radius", 0.1), take("dt", 0.1)
         self.max_speed, self.max_acceleration = take("max_speed", 1.0), take("max_acceleration", 2.0)
-        self.acceleration_range = take("acceleration_range", None)
-        low, high = self.acceleration_range or (1, 1)
-        if not 0 < low <= high <= 1:
-            raise ValueError(f"acceleration_range: got {self.acceleration_range}, must be 0 < low <= high <= 1")
+        self.acceleration_range, self.turn_gain = take("acceleration_range", None), take("turn_gain", None)
         self.observe_direction = take("observe_direction", True)
         self.formation_reward = take("formation_reward", "spring_damper")
         self.formation_weight, self.omega = take("formation_weight", 1.0), take("omega", 0.5)
@@ -179,10 +177,8 @@ class FormationNavigation(BaseScenario):
         self.goal[index] = goal
         self.arrived[index] = False
         self.held[index] = 0
-        if self.acceleration_range is not None:
-            low, high = self.acceleration_range
-            factor = low + (high - low) * torch.rand_like(self.acceleration[index])
-            self.acceleration[index] = self.max_acceleration * factor
+        ahead = goal - start
+        self.motion.draw(index, torch.atan2(ahead[..., 1], ahead[..., 0]))
         for i, agent in enumerate(self.world.agents):
             agent.set_pos(start[:, i] if env_index is None else start[0, i], batch_index=env_index)
             agent.set_vel(
@@ -315,16 +311,17 @@ class FormationNavigation(BaseScenario):
 
     def state_dict(self) -> dict[str, Tensor]:
         """Everything that the next step depends on, so that a run can be resumed exactly."""
-        state = {name: getattr(self, name).clone() for name in ("goal", "direction", "arrived", "held", "acceleration")}
-        return {"position": self._positions(), "velocity": self._velocities(), **state}
+        state = {name: getattr(self, name).clone() for name in ("goal", "direction", "arrived", "held")}
+        return {"position": self._positions(), "velocity": self._velocities(), **state, **self.motion.state_dict()}
 
     def load_state_dict(self, state: dict[str, Tensor]) -> None:
         """Put the team where :meth:`state_dict` found it."""
-        for name in ("goal", "direction", "arrived", "held", "acceleration"):
+        for name in ("goal", "direction", "arrived", "held"):
             getattr(self, name).copy_(state[name])
         for i, agent in enumerate(self.world.agents):
             agent.set_pos(state["position"][:, i], batch_index=None)
             agent.set_vel(state["velocity"][:, i], batch_index=None)
+        self.motion.load_state_dict(state)
         self._quantities = None
 
     def observation(self, agent: Agent) -> Tensor:
