@@ -174,7 +174,8 @@ class Config(Task):
     """Demonstrations of one plan for the team instead of one a robot, and what suits them: sets all options of
     recipes/config.py: COORDINATED, over what the command line gives for them."""
 
-    # what differs from robot to robot and from step to step in training and validation, not in demonstrations
+    # what differs from robot to robot and from step to step in training and validation, not in the final evaluation;
+    # of these, demonstrations have the wheels only
     action_delay: tuple[int, int] = (0, 0)
     """Smallest and largest delay of commands (steps), drawn for each team and episode."""
     observation_noise: float = 0.0
