@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Literal
 
@@ -15,6 +15,7 @@ from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModuleBase
 from torch import Tensor
 
+from redig.deploy.drive import LIMO
 from redig.envs.factory import make_env
 from redig.evaluation import rollout_trajectories, team_metrics
 from redig.files import replacing, write_csv
@@ -25,7 +26,7 @@ SHOWN = (
     "success_rate", "team_success_rate", "travel_time", "cfi_0.5", "cfi_0.1", "cfi_0.03", "jerk_mean", "collision_rate",
 )  # fmt: skip
 CASES = (
-    "VMAS", "MuJoCo", "slow turns", "weak motors", "grip 0.2", "grip 0.1", "grip 0.05", "ridge 0.1 m",
+    "VMAS", "MuJoCo", "limo", "slow turns", "weak motors", "grip 0.2", "grip 0.1", "grip 0.05", "ridge 0.1 m",
     "VMAS, 0.2 s late", "0.2 s late", "VMAS, noise 0.05", "noise 0.05",
 )  # fmt: skip
 
@@ -56,7 +57,10 @@ def case(name: str, scenario: dict[str, Any], starts: int) -> Any:
     """
     if name not in CASES:
         raise ValueError(f"cases: got {name!r}, allowed are {', '.join(CASES)}")
+    body = RobotBody()
+    limo = replace(LIMO, track=body.track, wheel_radius=body.wheel_radius)  # 1 rad/s; gain as of redig-robot
     changes: dict[str, dict[str, Any]] = {
+        "limo": {"base": limo, "gain": 4.0},
         "slow turns": {"gain": 2.0},
         "weak motors": {"body": RobotBody(torque=0.04)},  # 1 m/s²
         "0.2 s late": {"action_delay": (2, 2)},
