@@ -183,10 +183,8 @@ class Config(Task):
     acceleration_range: tuple[float, float] = (1.0, 1.0)
     """Smallest and largest factor on the acceleration limit, drawn for each team and episode."""
     turn_gain: tuple[float, float] | None = None
-    """Robots have wheels, and turn towards commands with a gain between these two (1/s), drawn for each team and
+    """Robots have wheels, and turn towards commands at a rate between these two (1/s), drawn for each team and
     episode; None: they move in any direction at once."""
-    turn_limit: tuple[float, float] | None = None
-    """With turn_gain, smallest and largest limit on how fast robots turn (rad/s), drawn likewise; None: 6."""
 
     # demonstrations and cloning
     num_trajectories: int = 5000
@@ -295,10 +293,6 @@ class Config(Task):
     ray_workers: int = 2
     """Workers there, of one CPU each, which share num_envs equally."""
 
-    def wheels(self) -> dict[str, Any]:
-        """Arguments of :func:`redig.envs.make_env` for how robots turn."""
-        return {"turn_gain": self.turn_gain, "turn_limit": self.turn_limit}
-
     def randomisation(self) -> dict[str, Any]:
         """Arguments of :func:`redig.envs.make_env` for the teams that train, beside those of the scenario."""
         scaled = tuple(self.acceleration_range) != (1, 1)
@@ -306,7 +300,7 @@ class Config(Task):
             "action_delay": self.action_delay,
             "observation_noise": self.observation_noise,
             "acceleration_range": self.acceleration_range if scaled else None,
-            **self.wheels(),
+            "turn_gain": self.turn_gain,
         }
 
     def resolve(self) -> Config:

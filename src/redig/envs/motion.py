@@ -22,8 +22,7 @@ class Motion:
         max_speed: (m/s).
         max_acceleration: (m/s²).
         acceleration_range: smallest and largest factor on ``max_acceleration``; ``None``: 1.
-        turn_gain: smallest and largest gain (1/s) of :class:`~redig.envs.turning.TurningCommand`; ``None``: points.
-        turn_limit: smallest and largest limit on how fast they turn (rad/s); ``None``: 6.
+        turn_gain: slowest and fastest turn (1/s) of :class:`~redig.envs.turning.TurningCommand`; ``None``: points.
 
     Raises:
         ValueError: for a range that is not one, or a factor above 1.
@@ -46,27 +45,20 @@ class Motion:
         max_acceleration: float,
         acceleration_range: Range = None,
         turn_gain: Range = None,
-        turn_limit: Range = None,
     ) -> None:
         low, high = acceleration_range or (1, 1)
         if not 0 < low <= high <= 1:
             raise ValueError(f"acceleration_range: got {acceleration_range}, must be 0 < low <= high <= 1")
-        for name, given, unit in (("turn_gain", turn_gain, "1/s"), ("turn_limit", turn_limit, "rad/s")):
-            low, high = given or (1, 1)
-            if not 0 < low <= high < float("inf"):
-                raise ValueError(f"{name}: got {given}, must be 0 < low <= high ({unit})")
-        if turn_limit is not None and turn_gain is None:
-            raise ValueError(f"turn_limit: got {turn_limit} without turn_gain, robots that are points do not turn")
-        self.max_acceleration = max_acceleration
-        self.acceleration_range, self.turn_gain, self.turn_limit = acceleration_range, turn_gain, turn_limit
+        slowest, fastest = turn_gain or (1, 1)
+        if not 0 < slowest <= fastest < float("inf"):
+            raise ValueError(f"turn_gain: got {turn_gain}, must be 0 < slowest <= fastest (1/s)")
+        self.max_acceleration, self.acceleration_range, self.turn_gain = max_acceleration, acceleration_range, turn_gain
         self.acceleration = torch.full((batch_dim, 1), float(max_acceleration), device=device)
         self.gain = torch.zeros(batch_dim, 1, device=device)
-        self.max_turn = torch.full((batch_dim, 1), 6.0, device=device)
         if turn_gain is None:
             self.robots = [VelocityCommand(dt, max_speed) for _ in range(n_robots)]
         else:
-            limits = self.gain, self.acceleration, self.max_turn
-            self.robots = [TurningCommand(dt, max_speed, *limits) for _ in range(n_robots)]
+            self.robots = [TurningCommand(dt, max_speed, self.gain, self.acceleration) for _ in range(n_robots)]
         if acceleration_range is not None:
             for robot in self.robots:
                 robot.acceleration = self.acceleration
@@ -83,8 +75,6 @@ class Motion:
         if self.turn_gain is not None:
             self.gain[index] = _drawn(self.gain[index], self.turn_gain)
             self._turned()[index] = heading.unsqueeze(-1)
-        if self.turn_limit is not None:
-            self.max_turn[index] = _drawn(self.max_turn[index], self.turn_limit)
 
     def _turned(self) -> Tensor:
         """Headings of all robots ``[B, n, 1]`` (rad), in one piece."""
@@ -96,16 +86,13 @@ class Motion:
     def state_dict(self) -> dict[str, Tensor]:
         """What the next step depends on."""
         state = {"acceleration": self.acceleration.clone()}
-        if self.turn_gain is not None:
-            state |= {"gain": self.gain.clone(), "max_turn": self.max_turn.clone(), "heading": self._turned()}
-        return state
+        return state if self.turn_gain is None else {**state, "gain": self.gain.clone(), "heading": self._turned()}
 
     def load_state_dict(self, state: dict[str, Tensor]) -> None:
         """Put it back."""
         self.acceleration.copy_(state["acceleration"])
         if self.turn_gain is not None:
             self.gain.copy_(state["gain"])
-            self.max_turn.copy_(state["max_turn"])
             self._turned().copy_(state["heading"])
 
 

@@ -39,9 +39,8 @@ class FormationNavigation(BaseScenario):
       and ``heading_jitter`` (rad): half ranges of what is added to each.
     * ``radius`` (m), ``max_speed`` (m/s), ``max_acceleration`` (m/s²), ``dt`` (s): the robots. ``acceleration_range``:
       smallest and largest factor on ``max_acceleration``, drawn for each team at its reset; ``None``: 1. ``turn_gain``:
-      smallest and largest gain (1/s) with which robots with wheels turn towards commands, ``turn_limit``: limit on how
-      fast they turn (rad/s; ``None``: 6), drawn likewise; they start facing their goals, see
-      :class:`~redig.envs.TurningCommand`. No ``turn_gain``: points that move in any direction at once.
+      slowest and fastest turn towards commands (1/s), drawn likewise, of robots with wheels that start facing their
+      goals, see :class:`~redig.envs.TurningCommand`; ``None``: points that move in any direction at once.
     * ``observe_direction``: add the unit vector to the nearest obstacle (9 numbers); ``False`` gives the paper's 7.
     * ``formation_reward``: one of ``spring_damper`` (Eq. 29), ``spring_damper_bonus``, ``scaled``, ``slanted``,
       ``integrity``, ``none``; ``formation_weight``; ``omega``. The frame of ``scaled`` and ``slanted`` is the goal's
@@ -83,9 +82,8 @@ class FormationNavigation(BaseScenario):
         self.offsets = offsets.to(device)
         self.desired = pairwise_distances(self.offsets)
         self.obstacle_map = self.obstacle_map.to(device)
-        limits = self.dt, self.max_speed, self.max_acceleration
-        ranges = self.acceleration_range, self.turn_gain, self.turn_limit
-        self.motion = Motion(self.n_robots, batch_dim, device, *limits, *ranges)
+        limits = self.dt, self.max_speed, self.max_acceleration, self.acceleration_range, self.turn_gain
+        self.motion = Motion(self.n_robots, batch_dim, device, *limits)
         world = World(batch_dim, device, dt=self.dt, drag=0.0)
         for i in range(self.n_robots):
             world.add_agent(
@@ -123,9 +121,9 @@ class FormationNavigation(BaseScenario):
         self.heading_jitter = take("heading_jitter", 0.1)
         self.radius, self.dt = take("radius", 0.1), take("dt", 0.1)
         self.max_speed, self.max_acceleration = take("max_speed", 1.0), take("max_acceleration", 2.0)
-        for name in ("acceleration_range", "turn_gain", "turn_limit"):
-            given = take(name, None)
-            setattr(self, name, given if given is None else tuple(given))  # as demonstrations are told apart by it
+        self.acceleration_range, self.turn_gain = take("acceleration_range", None), take("turn_gain", None)
+        if self.turn_gain is not None:
+            self.turn_gain = tuple(self.turn_gain)  # as demonstrations are told apart by it, however it was given
         self.observe_direction = take("observe_direction", True)
         self.formation_reward = take("formation_reward", "spring_damper")
         self.formation_weight, self.omega = take("formation_weight", 1.0), take("omega", 0.5)

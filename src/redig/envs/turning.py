@@ -25,7 +25,7 @@ class TurningCommand(VelocityCommand):
         max_speed: limit on the norm of the command (m/s).
         gain: how fast the angle is closed, of each environment ``[B, 1]`` (1/s).
         acceleration: limit along the heading, of each environment ``[B, 1]`` (m/s²).
-        max_turn: fastest turn, of each environment ``[B, 1]`` or of all (rad/s).
+        max_turn: fastest turn (rad/s).
 
     Attributes:
         heading: of the robot in each environment ``[B, 1]`` (rad), counter-clockwise from x.
@@ -46,9 +46,7 @@ class TurningCommand(VelocityCommand):
 
     acceleration: Tensor
 
-    def __init__(
-        self, dt: float, max_speed: float, gain: Tensor, acceleration: Tensor, max_turn: Tensor | float = 6.0
-    ) -> None:
+    def __init__(self, dt: float, max_speed: float, gain: Tensor, acceleration: Tensor, max_turn: float = 6.0) -> None:
         super().__init__(dt, max_speed)
         self.gain, self.acceleration, self.max_turn = gain, acceleration, max_turn
         self.heading = torch.zeros_like(gain)
@@ -61,8 +59,7 @@ class TurningCommand(VelocityCommand):
         behind = error.abs() > math.pi / 2
         error = torch.where(behind, wrapped(error + math.pi), error)
         closed = error * (1 - torch.exp(-self.gain * (speed / SLOW).clamp_max(1) * self.dt))
-        widest = torch.as_tensor(self.max_turn * self.dt, dtype=closed.dtype, device=closed.device)
-        turn = closed.clamp(-widest, widest)
+        turn = closed.clamp(-self.max_turn * self.dt, self.max_turn * self.dt)
 
         velocity = self.agent.state.vel
         before = (velocity * unit_vector(self.heading)).sum(-1, keepdim=True)
