@@ -73,6 +73,18 @@ def test_differential_drives_do_not_go_sideways(policy, drive):
     assert command.left == 0.0 and command.turn > 0
 
 
+def test_a_turn_is_limited_as_asked(policy):
+    drive = make_drive(Arguments(policy, "robot_0", drive="limo", max_angular=0.3))
+    turns = [drive((0.0, 0.5), 0.0).turn for _ in range(20)]
+    assert max(turns) == pytest.approx(0.3)
+
+
+@pytest.mark.parametrize("drive, limit", [("holonomic", 1.0), ("limo", 0.0), ("limo", -1.0)])
+def test_a_bad_limit_of_turning_is_refused(policy, drive, limit):
+    with pytest.raises(ValueError, match="max_angular"):
+        make_drive(Arguments(policy, "robot_0", drive=drive, max_angular=limit))
+
+
 def test_help_is_shown_without_torch():
     program = (
         "import sys; sys.argv = ['redig-robot', '--help']\ntry:\n    from redig.deploy.command import main; main()"

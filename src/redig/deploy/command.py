@@ -5,7 +5,7 @@ from __future__ import annotations
 import logging
 import signal
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from threading import Event
 from typing import Literal
@@ -76,6 +76,8 @@ class Arguments:
     """Hold within this distance of the goal (m); default: that of the policy's training."""
     drive: Literal["holonomic", "limo", "warthog"] = "holonomic"
     """How the robot moves: in all directions, or with the differential drive and the limits of such a base."""
+    max_angular: float | None = None
+    """With a differential drive, the fastest turn (rad/s); default: that of the base."""
 
 
 def main(args: Sequence[str] | None = None) -> None:
@@ -136,10 +138,18 @@ def make_drive(arguments: Arguments) -> Drive:
     Examples:
         >>> make_drive(Arguments(Path("robot.onnx"), "robot_0"))((0.5, 0.25), 0.0)
         BodyVelocity(forward=0.5, left=0.25, turn=0.0)
+
+    Raises:
+        ValueError: for a limit of turning that is not positive, or of a robot that does not turn.
     """
     if arguments.drive == "holonomic":
+        if arguments.max_angular is not None:
+            raise ValueError(f"max_angular: got {arguments.max_angular} for a holonomic drive, which does not turn")
         return holonomic
-    return Wheels(DifferentialDrive({"limo": LIMO, "warthog": WARTHOG}[arguments.drive]))
+    base = {"limo": LIMO, "warthog": WARTHOG}[arguments.drive]
+    if arguments.max_angular is not None:
+        base = replace(base, max_angular=arguments.max_angular)
+    return Wheels(DifferentialDrive(base))
 
 
 def make_transport(arguments: Arguments) -> Transport:
