@@ -20,12 +20,14 @@ TEST_SEED = 2_000_000  # starts of the final evaluation, the same for every trai
 def score(metrics: dict[str, float]) -> float:
     """What the best policy has most of: robots and teams that arrive, then formation, then speed, then smoothness.
 
-    Jerk above 2 m/s³ costs at most 0.5, so that no policy that moves counts less than one that stands still.
+    Formation and jerk count for the share of robots that arrive, and jerk costs at most 0.5: a team that stands still
+    in perfect formation is worth less than any robot that arrives.
     """
     time = metrics["travel_time"] if metrics["travel_time_teams"] > 0 else 20.0
     excess_jerk = min(max(metrics["jerk_mean"] - 2.0, 0.0), 5.0)
-    success = 2 * metrics["success_rate"] + 2 * metrics["team_success_rate"]
-    return success + metrics["cfi_0.5"] - 0.1 * time - 0.1 * excess_jerk
+    arrived = metrics["success_rate"]
+    success = 2 * arrived + 2 * metrics["team_success_rate"]
+    return success + arrived * (metrics["cfi_0.5"] - 0.1 * excess_jerk) - 0.1 * time
 
 
 def finish(run: Run, config: Task) -> dict[str, float]:
