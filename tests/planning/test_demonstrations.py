@@ -133,6 +133,8 @@ def test_second_call_reads_the_file(tmp_path, monkeypatch):
         ({"num_envs": 3}, {}),
         ({"formation": "wedge"}, {}),
         ({"collision_penalty": 2.0}, {}),
+        ({"turn_gain": (2.0, 8.0)}, {}),
+        ({"turn_gain": [2.0, 8.0]}, {}),
         ({"corridor_width": 1.0}, {}),
         ({"obstacle_map": doorway(gap=1.1)}, {}),
         ({"obstacle_map": replace(corridor(), route=torch.tensor([[-2.7, 0.0], [2.7, 0.0]]))}, {}),
@@ -144,6 +146,12 @@ def test_any_other_setting_makes_another_file(tmp_path, env, settings):
     demonstrations(make_env(2), **usual, cache_dir=tmp_path)
     demonstrations(make_env(**{"num_envs": 2, **env}), **{**usual, **settings}, cache_dir=tmp_path)
     assert len(list(tmp_path.iterdir())) == 2
+
+
+def test_a_range_as_json_has_it_makes_the_same_file(tmp_path):
+    for turn_gain in ((2.0, 8.0), [2.0, 8.0]):
+        demonstrations(make_env(2, turn_gain=turn_gain), 6, max_steps=3, cache_dir=tmp_path)
+    assert len(list(tmp_path.iterdir())) == 1
 
 
 def test_a_scenario_with_a_formation_of_its_own_makes_another_file(tmp_path):

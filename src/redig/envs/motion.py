@@ -55,13 +55,17 @@ class Motion:
         self.max_acceleration, self.acceleration_range, self.turn_gain = max_acceleration, acceleration_range, turn_gain
         self.acceleration = torch.full((batch_dim, 1), float(max_acceleration), device=device)
         self.gain = torch.zeros(batch_dim, 1, device=device)
-        if turn_gain is None:
-            self.robots = [VelocityCommand(dt, max_speed) for _ in range(n_robots)]
-        else:
-            self.robots = [TurningCommand(dt, max_speed, self.gain, self.acceleration) for _ in range(n_robots)]
-        if acceleration_range is not None:
-            for robot in self.robots:
-                robot.acceleration = self.acceleration
+        self.heading = torch.zeros(batch_dim, n_robots, 1, device=device)
+        self.robots = [self._robot(i, dt, max_speed) for i in range(n_robots)]
+
+    def _robot(self, i: int, dt: float, max_speed: float) -> VelocityCommand:
+        if self.turn_gain is not None:
+            wheeled = TurningCommand(dt, max_speed, self.gain, self.acceleration)
+            wheeled.heading = self.heading[:, i]
+            return wheeled
+        point = VelocityCommand(dt, max_speed)
+        point.acceleration = None if self.acceleration_range is None else self.acceleration
+        return point
 
     @property
     def max_force(self) -> float | None:
@@ -74,26 +78,20 @@ class Motion:
             self.acceleration[index] = self.max_acceleration * _drawn(self.acceleration[index], self.acceleration_range)
         if self.turn_gain is not None:
             self.gain[index] = _drawn(self.gain[index], self.turn_gain)
-            self._turned()[index] = heading.unsqueeze(-1)
+            self.heading[index] = heading.unsqueeze(-1)
 
-    def _turned(self) -> Tensor:
-        """Headings of all robots ``[B, n, 1]`` (rad), in one piece."""
-        heading = torch.stack([robot.heading for robot in self.robots], 1)  # type: ignore[union-attr]
-        for i, robot in enumerate(self.robots):
-            robot.heading = heading[:, i]  # type: ignore[union-attr]
-        return heading
+    @property
+    def _state(self) -> tuple[str, ...]:
+        return ("acceleration",) if self.turn_gain is None else ("acceleration", "gain", "heading")
 
     def state_dict(self) -> dict[str, Tensor]:
         """What the next step depends on."""
-        state = {"acceleration": self.acceleration.clone()}
-        return state if self.turn_gain is None else {**state, "gain": self.gain.clone(), "heading": self._turned()}
+        return {name: getattr(self, name).clone() for name in self._state}
 
     def load_state_dict(self, state: dict[str, Tensor]) -> None:
         """Put it back."""
-        self.acceleration.copy_(state["acceleration"])
-        if self.turn_gain is not None:
-            self.gain.copy_(state["gain"])
-            self._turned().copy_(state["heading"])
+        for name in self._state:
+            getattr(self, name).copy_(state[name])
 
 
 def _drawn(like: Tensor, bounds: tuple[float, float]) -> Tensor:

@@ -122,8 +122,6 @@ class FormationNavigation(BaseScenario):
         self.radius, self.dt = take("radius", 0.1), take("dt", 0.1)
         self.max_speed, self.max_acceleration = take("max_speed", 1.0), take("max_acceleration", 2.0)
         self.acceleration_range, self.turn_gain = take("acceleration_range", None), take("turn_gain", None)
-        if self.turn_gain is not None:
-            self.turn_gain = tuple(self.turn_gain)  # as demonstrations are told apart by it, however it was given
         self.observe_direction = take("observe_direction", True)
         self.formation_reward = take("formation_reward", "spring_damper")
         self.formation_weight, self.omega = take("formation_weight", 1.0), take("omega", 0.5)

@@ -66,7 +66,7 @@ class TurningCommand(VelocityCommand):
         wanted = torch.where(behind, -speed, speed) * (error - turn).cos()
         most = self.acceleration * self.dt
         change = (wanted - before).clamp(-most, most)
-        self.heading = wrapped(self.heading + turn)
+        self.heading.copy_(wrapped(self.heading + turn))  # in place: it may be a view of a whole team's
         self.agent.state.force = self.agent.mass * ((before + change) * unit_vector(self.heading) - velocity) / self.dt
 
 

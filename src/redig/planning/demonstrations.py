@@ -213,7 +213,14 @@ def _plain_map(value: Any) -> Any:
 
 
 def _plain_attributes(thing: object) -> dict:
-    return {k: v for k, v in vars(thing).items() if isinstance(v, (bool, int, float, str, tuple)) and k != "training"}
+    """Attributes that are plain values; a list of them, as JSON has tuples, counts as the tuple."""
+    plain = (bool, int, float, str)
+    listed = {k: tuple(v) if _is_list_of(v, plain) else v for k, v in vars(thing).items()}
+    return {k: v for k, v in listed.items() if isinstance(v, (*plain, tuple)) and k != "training"}
+
+
+def _is_list_of(value: object, kinds: tuple[type, ...]) -> bool:
+    return isinstance(value, list) and all(isinstance(each, kinds) for each in value)
 
 
 def _save(data: TensorDict, path: Path) -> None:
