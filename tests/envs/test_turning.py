@@ -33,8 +33,11 @@ def robot(gain, **kwargs):
 
 
 def integrated(gain, command, seconds, dt=0.001):
-    """The same by the drive that robots have, whose limits but those of speed and acceleration are out of the way."""
-    base = Base(0.2, 0.2, 0.05, 0.03, 1.0, 6.0, max_linear_acceleration=2.0, max_angular_acceleration=1e4)
+    """The same by the drive that robots have, whose limits but those of speed and acceleration are out of the way.
+
+    So narrow a base may turn faster by 4000 rad/s in a second; with a track of 5 cm it was late by 0.1 rad.
+    """
+    base = Base(0.2, 0.2, 0.001, 0.03, 1.0, 6.0, max_linear_acceleration=2.0, max_angular_acceleration=1e4)
     drive = DifferentialDrive(base, gain=gain, stop_speed=0.0)
     x = y = heading = linear = 0.0
     for _ in range(round(seconds / dt)):
@@ -52,9 +55,9 @@ def test_it_moves_as_the_drive_of_the_robots_does(gain, angle, speed, steps):
     command = (speed * math.cos(angle), speed * math.sin(angle))
     position, velocity, heading = robot(gain)(command, steps)
     expected, linear, exact = integrated(gain, command, 0.1 * steps)
-    assert abs(wrapped(torch.tensor(heading - exact)).item()) < 0.12  # within a step of the acceleration of turning
-    assert abs(velocity.norm().item() - abs(linear)) < 0.12
-    assert (position - expected).norm() < 0.06 + 0.02 * steps * 0.1
+    assert abs(wrapped(torch.tensor(heading - exact)).item()) < 0.06  # a step that begins at the limit of turning
+    assert abs(velocity.norm().item() - abs(linear)) < 0.02
+    assert (position - expected).norm() < 0.05 + 0.02 * steps * 0.1
 
 
 def test_velocity_is_along_the_heading_and_within_the_limits():
