@@ -28,6 +28,7 @@ SHOWN = (
 CASES = (
     "VMAS", "MuJoCo", "limo", "slow turns", "weak motors", "grip 0.2", "grip 0.1", "grip 0.05", "ridge 0.1 m",
     "VMAS, 0.2 s late", "0.2 s late", "VMAS, noise 0.05", "noise 0.05",
+    "0.5 m/s", "limo, 0.5 m/s", "grip 0.1, 0.5 m/s", "grip 0.05, 0.5 m/s",
 )  # fmt: skip
 
 
@@ -69,8 +70,9 @@ def case(name: str, scenario: dict[str, Any], starts: int) -> Any:
         **{f"grip {mu}": {"ground": Ground(friction=mu)} for mu in (0.2, 0.1, 0.05)},
     }
     simulator = None if name.startswith("VMAS") else PhysicsNavigation()
-    change = changes.get(name.removeprefix("VMAS, "), {})
-    return make_env(starts, scenario=simulator, **scenario, **change)
+    kind = name.removeprefix("VMAS, ").removesuffix("0.5 m/s").rstrip(", ")
+    slow = {"speed_range": (0.5, 0.5)} if name.endswith("0.5 m/s") else {}
+    return make_env(starts, scenario=simulator, **scenario, **changes.get(kind, {}), **slow)
 
 
 def tracking(trajectories: TensorDictBase) -> dict[str, Tensor]:

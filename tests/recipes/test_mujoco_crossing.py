@@ -3,8 +3,10 @@ from pathlib import Path
 
 import pytest
 import torch
-from mujoco_crossing import Arguments, main, tracking
+from mujoco_crossing import Arguments, case, main, tracking
 from tensordict import TensorDict
+
+from redig.policy import read_header
 
 WEDGE = Path(__file__).parents[2] / "recipes/policies/wedge.safetensors"
 
@@ -17,6 +19,18 @@ def test_cases_are_written_with_spread_and_a_crossing_is_drawn(tmp_path):
     assert float(rows[1]["travel_time"]) > float(rows[0]["travel_time"])  # wheels that slip are slower
     assert float(rows[0]["error_across"]) < float(rows[1]["error_across"])
     assert {path.name for path in tmp_path.iterdir()} == {"wedge.csv", "wedge.png", "wedge.mp4"}
+
+
+@pytest.mark.parametrize("name", ["0.5 m/s", "limo, 0.5 m/s", "grip 0.05, 0.5 m/s"])
+def test_slow_teams_are_slow_and_what_they_are_called_besides(name):
+    _, scenario = read_header(WEDGE)
+    env = case(name, scenario, 1)
+    env.set_seed(0)
+    env.rollout(1)
+    assert env.scenario.motion.speed.unique().item() == 0.5
+    assert env.scenario.drives[0][0].base.max_angular == (1.0 if "limo" in name else 6.0)
+    plain = case("MuJoCo", scenario, 1).scenario
+    assert (env.scenario.teams[0].model.geom_friction != plain.teams[0].model.geom_friction).any() == ("grip" in name)
 
 
 def test_tracking_of_a_robot_that_makes_half_of_each_step_and_drifts():

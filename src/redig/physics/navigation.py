@@ -35,6 +35,8 @@ class PhysicsNavigation(FormationNavigation):
     * ``base`` (:class:`~redig.deploy.drive.Base`): limits of the drive; default: see :func:`base_of`. ``gain`` (1/s):
       how fast it turns. ``drive_interval`` (s): between two of its commands.
 
+    ``acceleration_range`` and ``turn_gain`` of the scenario mean nothing here: motors, grip and drive decide that.
+
     Raises:
         ValueError: as the scenario that it extends; and for a body of another radius, or a ``drive_interval`` that
             does not divide ``dt``.
@@ -87,7 +89,7 @@ class PhysicsNavigation(FormationNavigation):
     def _settle(self) -> tuple[Tensor, Tensor, Tensor]:
         """Let MuJoCo carry out the commands from where it was; what VMAS made of them is replaced."""
         action = torch.stack([agent.action.u for agent in self.world.agents], 1)
-        command = limit_norm(action, self.max_speed).double().cpu().numpy()
+        command = limit_norm(action, self.motion.speed.unsqueeze(1)).double().cpu().numpy()
         touched = np.stack([self._drive(*each) for each in zip(self.teams, self.drives, command, strict=True)])
         position = self.goal.new_tensor(np.stack([team.position for team in self.teams]))
         velocity = self.goal.new_tensor(np.stack([team.velocity for team in self.teams]))
