@@ -1,6 +1,7 @@
 import os
 import signal
 import sys
+import threading
 from functools import partial
 from pathlib import Path
 
@@ -83,6 +84,43 @@ def test_a_worker_that_dies_while_it_collects_costs_no_batch(tmp_path):
         assert experience.restarts == 1
     finally:
         experience.shutdown()
+
+
+@pytest.fixture
+def slow_start(monkeypatch):
+    """A function that makes a collection without a cluster, whose workers fail to start so many times."""
+    ray = pytest.importorskip("ray", reason="needs ray: pip install 'redig[ray]'")
+    released, connected = threading.Event(), []
+
+    def make(failures):
+        def start(experience):
+            if experience.restarts < failures:
+                released.wait(60)  # as RayCollector was seen to
+            return [torch.tensor(experience.restarts)]
+
+        monkeypatch.setattr(RayCollection, "START_TIMEOUT", 0.05)
+        monkeypatch.setattr(RayCollection, "_start", start)
+        monkeypatch.setattr(RayCollection, "shutdown", lambda experience: setattr(experience, "collector", None))
+        monkeypatch.setattr(ray, "is_initialized", lambda: False)
+        monkeypatch.setattr(ray, "init", lambda *_, **__: connected.append("init"))
+        monkeypatch.setattr(ray, "shutdown", lambda: connected.append("shutdown"))
+        return collection()[0], connected
+
+    yield make
+    released.set()
+
+
+def test_workers_that_never_start_are_given_up_and_started_again(slow_start):
+    experience, connected = slow_start(failures=2)
+    with pytest.warns(UserWarning, match="workers did not start within 0.05 s"):
+        assert next(experience) == 2
+    assert connected == ["init", "shutdown", "init", "shutdown", "init"]
+
+
+def test_workers_that_never_start_at_all_are_an_error(slow_start):
+    experience, _ = slow_start(failures=3)
+    with pytest.warns(UserWarning), pytest.raises(TimeoutError, match="workers did not start within 0.05 s"):
+        next(experience)
 
 
 @pytest.mark.parametrize("workers", [0, 3])

@@ -8,6 +8,7 @@ nothing afterwards. Ray's own ``max_restarts`` does not help: the process group 
 from __future__ import annotations
 
 import sys
+import threading
 import warnings
 from collections.abc import Callable, Iterator
 from functools import partial
@@ -48,6 +49,7 @@ class RayCollection(Iterator[TensorDictBase]):
         ImportError: if Ray is missing; the message names the extra to install.
         ValueError: if ``num_workers`` is less than 1 or does not divide ``num_envs``.
         ConnectionError: from Ray, if there is no cluster at the address.
+        TimeoutError: from ``next``, if workers did not start within ``START_TIMEOUT`` seconds, ``ATTEMPTS`` times.
 
     Examples:
         >>> from redig.envs import make_env
@@ -58,6 +60,9 @@ class RayCollection(Iterator[TensorDictBase]):
     """
 
     ATTEMPTS = 3  # without a batch in between, before a loss of workers is an error
+    START_TIMEOUT = (
+        180.0  # s for workers to start and connect: RayCollector itself may wait for ever for one that idles
+    )
 
     def __init__(
         self,
@@ -80,9 +85,9 @@ class RayCollection(Iterator[TensorDictBase]):
         self.env_maker, self.policy, self.postproc = env_maker, policy, postproc
         self.num_envs, self.num_steps, self.num_workers, self.seed = num_envs, num_steps, num_workers, seed
         self.restarts = 0
+        self.address = address
         if not ray.is_initialized():  # here, because RayCollector would end a cluster that it has started itself
-            local: dict[str, Any] = {"num_cpus": num_workers, "include_dashboard": False} if address == "local" else {}
-            ray.init(address, log_to_driver=False, **local)
+            self._connect()
         self.collector: RayCollector | None = None  # from the first batch on
 
     def __next__(self) -> TensorDictBase:
@@ -92,14 +97,17 @@ class RayCollection(Iterator[TensorDictBase]):
         for attempt in range(self.ATTEMPTS):
             try:
                 if self.collector is None:
-                    self._start()
+                    self.collector = self._started_in_time()
+                    self._batches = iter(self.collector)
                 return next(self._batches)
             except RayTaskError:  # the environment or the policy has raised it: a new worker would do the same
                 raise
-            except (RayActorError, RuntimeError) as error:  # RuntimeError: weights could not be sent
+            except (RayActorError, RuntimeError, TimeoutError) as error:  # RuntimeError: weights could not be sent
                 if attempt + 1 == self.ATTEMPTS:
                     raise
                 warnings.warn(f"lost a worker, all are started again: {error}", stacklevel=2)
+                if isinstance(error, TimeoutError):
+                    self._connect(again=True)
                 self.shutdown()
                 self.restarts += 1
         raise AssertionError("unreachable")
@@ -110,7 +118,37 @@ class RayCollection(Iterator[TensorDictBase]):
             self.collector.shutdown()
             self.collector = None
 
-    def _start(self) -> None:
+    def _connect(self, again: bool = False) -> None:
+        """Connect to the cluster; ``again``: leave it first, with which it stops all workers of this process."""
+        import ray
+
+        if again:
+            ray.shutdown()
+        local: dict[str, Any] = (
+            {"num_cpus": self.num_workers, "include_dashboard": False} if self.address == "local" else {}
+        )
+        ray.init(self.address, log_to_driver=False, **local)
+
+    def _started_in_time(self) -> RayCollector:
+        """Workers, started beside the main thread, which can give up on them."""
+        outcome: list[RayCollector | BaseException] = []
+
+        def start() -> None:
+            try:
+                outcome.append(self._start())
+            except BaseException as error:
+                outcome.append(error)
+
+        thread = threading.Thread(target=start, name="start of Ray workers", daemon=True)
+        thread.start()
+        thread.join(self.START_TIMEOUT)
+        if not outcome:
+            raise TimeoutError(f"workers did not start within {self.START_TIMEOUT:g} s")
+        if isinstance(outcome[0], BaseException):
+            raise outcome[0]
+        return outcome[0]
+
+    def _start(self) -> RayCollector:
         import ray
         from torchrl.collectors.distributed import RayCollector
 
@@ -121,7 +159,7 @@ class RayCollection(Iterator[TensorDictBase]):
             2**31, (workers,), generator=torch.Generator().manual_seed(self.seed + 10_007 * self.restarts)
         )
         makers = [partial(_seeded, self.env_maker, self.num_envs // workers, int(seed)) for seed in seeds]
-        self.collector = RayCollector(
+        collector = RayCollector(
             makers,
             self.policy,
             frames_per_batch=self.num_envs * self.num_steps,
@@ -134,8 +172,8 @@ class RayCollection(Iterator[TensorDictBase]):
             collector_kwargs=[{"auto_register_policy_transforms": False} for _ in makers],
             remote_configs={"num_cpus": 1},
         )
-        self.collector.update_policy_weights_()  # connects; after that, before each batch
-        self._batches = iter(self.collector)
+        collector.update_policy_weights_()  # connects; after that, before each batch
+        return collector
 
 
 class _Worker(Collector):
