@@ -1,21 +1,13 @@
-"""Options of the recipe, with a line of help for each."""
+"""Options of the recipe beside those of its task, with a line of help for each."""
 
 from __future__ import annotations
 
 import dataclasses
-import json
 from dataclasses import dataclass
-from pathlib import Path
-from typing import Any, Self
+from typing import Any
 
-from redig.envs.random_maps import MAP_KINDS
+from task import REWARD, Task
 
-# What suits each formation: too much weight, and a team keeps its shape rather than arrive; the bonus hurries it on.
-REWARD: dict[str, dict[str, Any]] = {
-    "wedge": {"formation_weight": 3.5, "arrival_bonus": 20.0},
-    "line": {"formation_weight": 1.0, "arrival_bonus": 10.0},
-    "circle": {"formation_weight": 2.0, "arrival_bonus": 20.0},
-}
 PAPER: dict[str, Any] = {  # Table 3 and Sec. 3 as printed, as far as the code still has it; docs/paper.md
     "encoder": "linear", "observe_direction": False, "shared_encoder": True, "formation_reward": "spring_damper",
     "formation_weight": 1.0, "omega": 0.5, "navigation_reward": "goal_speed", "arrival_bonus": 15.0,
@@ -34,130 +26,6 @@ SMOKE: dict[str, Any] = {  # the whole program in under a minute; it learns noth
     "num_trajectories": 100, "clone_updates": 20, "critic_updates": 20, "warmup_steps": 20, "env_steps": 40,
     "evaluation_interval": 20, "evaluation_starts": 8, "num_starts": 8, "num_envs": 8, "hidden": 32,
 }  # fmt: skip
-
-
-@dataclass
-class Task:
-    """What every recipe that trains a team has: its run, the task, the reward and the evaluation."""
-
-    out: Path | None = None
-    """Folder of the run; default runs/FORMATION-seedSEED."""
-    seed: int = 0
-    """Seed of everything: demonstrations, networks, training and evaluation starts."""
-    resume: Path | None = None
-    """Continue the run in this folder with its own configuration; all other options are ignored."""
-    smoke: bool = False
-    """Do everything at toy size, in under a minute."""
-    logger: str = "csv"
-    """csv, tensorboard or wandb (set WANDB_MODE=offline to log without a network)."""
-    threads: int | None = None
-    """Threads of PyTorch; default: its own choice. Results are bit-exact for a given number."""
-
-    # the task
-    formation: str = "wedge"
-    """wedge, line or circle."""
-    n_robots: int = 5
-    """Robots in the team."""
-    formation_width: float = 2.0
-    """Width of the formation (m)."""
-    map: str = "corridor"
-    """corridor (of the next two sizes), another kind of redig.envs.MAP_KINDS, of which every team gets its own random
-    map, or the path of a YAML file as ROS map servers write it, with gap and route."""
-    corridor_width: float = 1.1
-    """Width of the corridor (m)."""
-    corridor_length: float = 2.0
-    """Length of the corridor (m)."""
-    max_speed: float = 1.0
-    """Speed limit (m/s)."""
-    max_acceleration: float = 2.0
-    """Acceleration limit (m/s²)."""
-    observe_direction: bool = True
-    """Observe the unit vector to the nearest obstacle; without it the state is the paper's seven numbers."""
-
-    # the reward
-    formation_reward: str = "scaled"
-    """scaled, slanted, integrity (tau of the CFI), spring_damper_bonus, spring_damper (Eq. 29) or none."""
-    formation_weight: float | None = None
-    """Weight of the formation reward against progress in m/s; default: what suits the formation."""
-    omega: float = 0.8
-    """Balance of spring and damper in the spring-damper forms (paper: 0.5)."""
-    navigation_reward: str = "progress"
-    """progress or goal_speed (Eq. 30)."""
-    arrival_bonus: float | None = None
-    """Paid once to a robot on arrival (paper: 15); default: what suits the formation."""
-    collision_penalty: float = 20.0
-    """Penalty of a collision (paper: 1.5)."""
-    proximity_penalty: float = 0.5
-    """Ramp within 0.1 m of contact (paper: none)."""
-    collision_terminates: bool = True
-    """A collision ends the robot's return: its value is not bootstrapped."""
-    arrival_terminates: bool = False
-    """An arrival ends the robot's return; otherwise it holds and goes on earning the formation reward."""
-    reward_scale: float = 0.1
-    """Scale of the reward (paper: 0.01)."""
-
-    # what robots hear of each other
-    encoder: str = "edgeconv"
-    """edgeconv; linear as printed in the paper; or relu, the same with a ReLU behind W^z."""
-    edge_features: str = "state"
-    """What a message says of the difference between two robots: all of their state, or position only."""
-    radius: float = 2.0
-    """Communication range (m)."""
-
-    # evaluation
-    evaluation_interval: int = 200
-    """Steps of all teams between evaluations and checkpoints."""
-    evaluation_starts: int = 128
-    """Starts of an evaluation during training; the best policy is chosen on these."""
-    num_starts: int = 256
-    """Starts of the final evaluation, never trained on and never used for a choice."""
-
-    def scenario(self, split: str = "train") -> dict[str, Any]:
-        """Arguments of :class:`redig.envs.FormationNavigation`; random maps are those of a split."""
-        names = (
-            "formation", "n_robots", "formation_width", "corridor_width", "corridor_length", "max_speed",
-            "max_acceleration", "observe_direction", "formation_reward", "formation_weight", "omega",
-            "navigation_reward", "arrival_bonus", "collision_penalty", "proximity_penalty", "collision_terminates",
-            "arrival_terminates",
-        )  # fmt: skip
-        arguments = {name: getattr(self, name) for name in names}
-        if self.map != "corridor":
-            arguments["obstacle_map"] = f"{self.map}:{split}" if self.map in MAP_KINDS else self.map
-        return arguments
-
-    def ends_of_policy(self, observation_dim: int) -> dict[str, Any]:
-        """What every policy of the task has: the encoder that its observations go into, and the bounds of commands."""
-        return {
-            "observation_dim": observation_dim,
-            "action_low": (-self.max_speed,) * 2,
-            "action_high": (self.max_speed,) * 2,
-            "encoder": "linear" if self.encoder == "relu" else self.encoder,
-            "encoder_activation": None if self.encoder == "linear" else "relu",
-            "edge_features": self.edge_features,
-            "radius": self.radius,
-        }
-
-    def saved(self) -> Self:
-        """The configuration of the run in the folder to resume.
-
-        Raises:
-            FileNotFoundError: if the folder holds no run.
-        """
-        path = self.resume / "config.json" if self.resume else None
-        if path is None or not path.is_file():
-            raise FileNotFoundError(f"resume: {self.resume} holds no run (no config.json)")
-        return dataclasses.replace(self, **{**json.loads(path.read_text()), "resume": self.resume, "out": None})
-
-    def filled(self, defaults: dict[str, Any]) -> Self:
-        """This configuration with ``defaults`` in place of what is None."""
-        missing = {name: value for name, value in defaults.items() if getattr(self, name) is None}
-        return dataclasses.replace(self, **missing)
-
-    def check_positive(self, *names: str) -> None:
-        """Raise a ValueError that names the first of these options that is less than 1."""
-        for name in names:
-            if getattr(self, name) < 1:
-                raise ValueError(f"{name}: got {getattr(self, name)}, must be at least 1")
 
 
 @dataclass

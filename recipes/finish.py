@@ -5,9 +5,9 @@ from __future__ import annotations
 import platform
 
 import torch
-from config import Task
 from evaluate import draw_crossing
 from run import Run
+from task import Task
 
 from redig.envs.factory import make_env
 from redig.evaluation import evaluate, format_table, write_metrics

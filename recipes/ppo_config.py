@@ -6,7 +6,7 @@ import dataclasses
 from dataclasses import dataclass
 from typing import Any
 
-from config import REWARD, Task
+from task import REWARD, Task
 
 # What each method is paid for; all else, and what is not given on the command line, is as in the default recipe.
 METHODS: dict[str, dict[str, Any]] = {

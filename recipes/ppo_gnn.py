@@ -14,11 +14,11 @@ from pathlib import Path
 
 import torch
 import tyro
-from config import Task
 from finish import finish, score
 from ppo_config import PPOConfig
 from redig_wedge import VALIDATION_SEED, learning_rate
 from run import Run, check_logger
+from task import Task
 from tensordict import TensorDict, TensorDictBase
 from tensordict.nn import ProbabilisticTensorDictSequential, TensorDictModule
 from torch import Tensor

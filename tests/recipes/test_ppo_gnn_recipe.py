@@ -10,10 +10,11 @@ import ppo_gnn
 import ppo_tuning
 import pytest
 import torch
-from config import REWARD, Config
+from config import Config
 from conftest import command
 from PIL import Image
 from ppo_config import SMOKE, PPOConfig
+from task import REWARD
 from tensordict import TensorDict
 from torchrl.collectors import Collector
 from torchrl.envs.utils import ExplorationType, set_exploration_type
