@@ -43,7 +43,7 @@ class Config(Task):
     recipes/config.py: COORDINATED, over what the command line gives for them."""
 
     # what differs from robot to robot and from step to step in training and validation, not in the final evaluation;
-    # of these, demonstrations have the wheels and the speeds only
+    # of these, demonstrations have the wheels only
     action_delay: tuple[int, int] = (0, 0)
     """Smallest and largest delay of commands (steps), drawn for each team and episode."""
     observation_noise: float = 0.0
@@ -53,8 +53,6 @@ class Config(Task):
     turn_gain: tuple[float, float] | None = None
     """Robots have wheels, and turn towards commands at a rate between these two (1/s), drawn for each team and
     episode; None: they move in any direction at once."""
-    speed_range: tuple[float, float] = (1.0, 1.0)
-    """Smallest and largest factor on the speed limit, drawn for each team and episode; on ice, slow is safe."""
 
     # demonstrations and cloning
     num_trajectories: int = 5000
@@ -165,16 +163,13 @@ class Config(Task):
 
     def randomisation(self) -> dict[str, Any]:
         """Arguments of :func:`redig.envs.make_env` for the teams that train, beside those of the scenario."""
+        scaled = tuple(self.acceleration_range) != (1, 1)
         return {
             "action_delay": self.action_delay,
             "observation_noise": self.observation_noise,
-            "acceleration_range": _unless_one(self.acceleration_range),
-            **self.robots(),
+            "acceleration_range": self.acceleration_range if scaled else None,
+            "turn_gain": self.turn_gain,
         }
-
-    def robots(self) -> dict[str, Any]:
-        """Arguments of the scenario for robots that demonstrate as well as train: their wheels and their speed."""
-        return {"turn_gain": self.turn_gain, "speed_range": _unless_one(self.speed_range)}
 
     def resolve(self) -> Config:
         """The configuration to run: that of a run to resume, or this one at toy size, checked.
@@ -207,8 +202,3 @@ class Config(Task):
             if not 0 <= getattr(config, name) <= 1:
                 raise ValueError(f"{name}: got {getattr(config, name)}, must be in [0, 1]")
         return config
-
-
-def _unless_one(factors: tuple[float, float]) -> tuple[float, float] | None:
-    """A range of factors, or None where it changes nothing."""
-    return None if tuple(factors) == (1, 1) else factors

@@ -19,6 +19,7 @@ from redig.deploy.drive import LIMO
 from redig.envs.factory import make_env
 from redig.evaluation import rollout_trajectories, team_metrics
 from redig.files import replacing, write_csv
+from redig.pace import Paced
 from redig.physics import Ground, PhysicsNavigation, RobotBody
 from redig.policy import load_policy, read_header
 
@@ -28,7 +29,6 @@ SHOWN = (
 CASES = (
     "VMAS", "MuJoCo", "limo", "slow turns", "weak motors", "grip 0.2", "grip 0.1", "grip 0.05", "ridge 0.1 m",
     "VMAS, 0.2 s late", "0.2 s late", "VMAS, noise 0.05", "noise 0.05",
-    "0.5 m/s", "limo, 0.5 m/s", "grip 0.1, 0.5 m/s", "grip 0.05, 0.5 m/s",
 )  # fmt: skip
 
 
@@ -44,14 +44,16 @@ class Arguments:
     """Seed of the starts; those of training and validation are others."""
     cases: tuple[str, ...] = CASES
     """What to compare: names as in the table."""
+    pace: float = 1.0
+    """Drive in slow motion: 0.5 takes twice the time (redig.Paced)."""
     out: Path = Path("runs/mujoco")
     """Folder of FORMATION.csv and the pictures."""
     film: Literal["render", "plan", "none"] = "plan"
     """render: filmed by MuJoCo, which needs OpenGL (without a screen: MUJOCO_GL=egl); plan: drawn from above."""
 
 
-def case(name: str, scenario: dict[str, Any], starts: int) -> Any:
-    """The environment of a case: where it is, and what is different there.
+def case(name: str, scenario: dict[str, Any], starts: int, pace: float = 1.0) -> Any:
+    """The environment of a case, for a policy at a pace: where it is, and what is different there.
 
     Raises:
         ValueError: for an unknown name.
@@ -69,10 +71,11 @@ def case(name: str, scenario: dict[str, Any], starts: int) -> Any:
         "ridge 0.1 m": {"ground": Ground(ridge_height=0.1, ridge_angle=scenario.get("corridor_angle", 0.0))},
         **{f"grip {mu}": {"ground": Ground(friction=mu)} for mu in (0.2, 0.1, 0.05)},
     }
-    simulator = None if name.startswith("VMAS") else PhysicsNavigation()
-    kind = name.removeprefix("VMAS, ").removesuffix("0.5 m/s").rstrip(", ")
-    slow = {"speed_range": (0.5, 0.5)} if name.endswith("0.5 m/s") else {}
-    return make_env(starts, scenario=simulator, **scenario, **changes.get(kind, {}), **slow)
+    change = changes.get(name.removeprefix("VMAS, "), {})
+    paced = scenario | {"max_speed": pace * scenario.get("max_speed", 1.0)}
+    if name.startswith("VMAS"):
+        return make_env(starts, **paced, **change)
+    return make_env(starts, scenario=PhysicsNavigation(), pace=pace, **paced, **change)
 
 
 def tracking(trajectories: TensorDictBase) -> dict[str, Tensor]:
@@ -114,9 +117,8 @@ def measure(policy: TensorDictModuleBase, env: Any, seed: int) -> dict[str, floa
     return {**figures, "times_real_time": factor}
 
 
-def film(path: Path, policy: TensorDictModuleBase, scenario: dict[str, Any], seed: int) -> None:
+def film(path: Path, policy: TensorDictModuleBase, env: Any, seed: int) -> None:
     """One crossing, filmed by MuJoCo in real time."""
-    env = make_env(1, scenario=PhysicsNavigation(), **scenario)
     team = env.scenario.teams[0]
     camera = mujoco.MjvCamera()
     camera.lookat[:], camera.distance, camera.azimuth, camera.elevation = (0.0, 0.0, 0.0), 5.6, 90.0, -50.0
@@ -141,18 +143,20 @@ def main(arguments: Arguments) -> list[dict[str, Any]]:
     formation = scenario["formation"]
     rows: list[dict[str, Any]] = []
     for name in arguments.cases:
-        env = case(name, scenario, arguments.starts)
-        policy = load_policy(arguments.policy, env.observation_spec["agents", "observation"].shape[-1])
+        env = case(name, scenario, arguments.starts, arguments.pace)
+        trained = load_policy(arguments.policy, env.observation_spec["agents", "observation"].shape[-1])
+        policy = Paced(trained, arguments.pace)
         figures = measure(policy, env, arguments.seed)
-        rows.append({"case": name, "starts": arguments.starts, "seed": arguments.seed, **figures})
+        what = {"case": name, "pace": arguments.pace, "starts": arguments.starts, "seed": arguments.seed}
+        rows.append(what | figures)
         print(f"{name:22}" + ", ".join(f"{key} {figures[key]:.3f}" for key in SHOWN), flush=True)
     arguments.out.mkdir(parents=True, exist_ok=True)
     shown = [{k: f"{v:.6g}" if isinstance(v, float) else v for k, v in row.items()} for row in rows]
     write_csv(arguments.out / f"{formation}.csv", shown)
+    env = case("MuJoCo", scenario, 1, arguments.pace)
     if arguments.film == "render":
-        film(arguments.out / f"{formation}.mp4", policy, scenario, arguments.seed)
+        film(arguments.out / f"{formation}.mp4", policy, env, arguments.seed)
     elif arguments.film == "plan":
-        env = make_env(1, scenario=PhysicsNavigation(), **scenario)
         draw_crossing(arguments.out, policy, env, arguments.seed, f"{formation}.mp4")
     print(f"written to {arguments.out}")
     return rows

@@ -42,6 +42,8 @@ class Arguments(WorldArguments):
     """Commands per simulated second of each robot (Hz)."""
     drive: str = "limo"
     """Drive of the robots, see redig-robot --help; it must be one with wheels."""
+    pace: float = 1.0
+    """Drive in slow motion, see redig-robot --help."""
     max_angular: float | None = None
     """Fastest turn (rad/s); default: that of the drive, 1 rad/s of the Limo's."""
     out: Path = Path("runs/mujoco-robots")
@@ -54,6 +56,7 @@ class WheeledRobot(Robot):
     def __init__(self, arguments: Arguments, robot: str, robots: list[str]) -> None:
         super().__init__(arguments, robot, robots)
         self._command += ["--drive", arguments.drive, "--deadline", str(0.1 / arguments.speed)]
+        self._command += ["--pace", str(arguments.pace)]
         if arguments.max_angular is not None:
             self._command += ["--max-angular", str(arguments.max_angular)]
 

@@ -65,7 +65,7 @@ def train(config: Config) -> dict[str, float]:
 
     # Line 2: individual planners fill the buffer with uncoordinated trajectories
     multi_step = MultiStep(config.n_steps, config.gamma, keep=[OBSERVATION, ACTION, BASE_ACTION, ARRIVED])
-    same_robots = scenario | config.robots()  # but no delay, noise or weak motors
+    same_robots = {**scenario, "turn_gain": config.turn_gain}  # but no delay, noise or weak motors
     demo_env = make_env(min(250, config.num_trajectories), reward_scale=config.reward_scale, **same_robots)
     cache = folder.parent / "demonstrations"
     episodes = demonstrations(

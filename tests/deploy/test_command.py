@@ -79,6 +79,12 @@ def test_a_turn_is_limited_as_asked(policy):
     assert max(turns) == pytest.approx(0.3)
 
 
+def test_a_pace_reaches_the_drive(policy):
+    drive = make_drive(Arguments(policy, "robot_0", drive="limo", pace=0.5))
+    assert drive((0.03, 0.0), 0.0).forward > 0  # at its own pace it does not start below 0.05 m/s
+    assert make_drive(Arguments(policy, "robot_0", drive="limo"))((0.03, 0.0), 0.0).forward == 0
+
+
 @pytest.mark.parametrize("drive, limit", [("holonomic", 1.0), ("limo", 0.0), ("limo", -1.0)])
 def test_a_bad_limit_of_turning_is_refused(policy, drive, limit):
     with pytest.raises(ValueError, match="max_angular"):

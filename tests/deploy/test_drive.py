@@ -163,6 +163,20 @@ def test_a_wheel_in_a_turn_runs_on_its_own_circle():
     assert (left * 0.05 / 0.8, right * 0.05 / 1.2) == pytest.approx((0.5, 0.5))
 
 
+@given(st.floats(0.2, 1.0), st.floats(0.2, 1.0), st.floats(-math.pi, math.pi))
+def test_at_a_pace_a_drive_is_that_of_a_base_with_less_acceleration(pace, speed, angle):
+    """... and that starts and stops at lower speeds."""
+    slower = replace(
+        LIMO,
+        max_linear_acceleration=pace**2 * LIMO.max_linear_acceleration,
+        max_angular_acceleration=pace**2 * LIMO.max_angular_acceleration,
+    )
+    paced = DifferentialDrive(LIMO, pace=pace)
+    other = DifferentialDrive(slower, stop_speed=pace * 0.02, start_speed=pace * 0.05)
+    for vector in [(speed * math.cos(angle), speed * math.sin(angle))] * 20 + [(0.03 * pace, 0.0)] * 5:
+        assert paced(vector, 0.1, 0.05) == pytest.approx(other(vector, 0.1, 0.05))
+
+
 def test_bases_and_settings_that_are_none():
     for name in ("track", "wheel_radius", "max_linear", "max_angular_acceleration"):
         for value in (0.0, -1.0, math.nan):
@@ -172,3 +186,5 @@ def test_bases_and_settings_that_are_none():
         DifferentialDrive(LIMO, gain=0.0)
     with pytest.raises(ValueError, match="stop_speed, start_speed: got 0.1, 0.05"):
         DifferentialDrive(LIMO, stop_speed=0.1)
+    with pytest.raises(ValueError, match="pace: got 1.5"):
+        DifferentialDrive(LIMO, pace=1.5)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 
-from redig.deploy.messages import Vector
+from redig.deploy.messages import Vector, check_pace
 
 
 @dataclass(frozen=True)
@@ -92,9 +92,12 @@ class DifferentialDrive:
         gain: how fast the angle is closed (1/s); at most half the rate of the calls, or it overshoots.
         reverse: drive backwards; not for a robot that does not see behind.
         stop_speed, start_speed: (m/s).
+        pace: for vectors of a policy in slow motion, see :class:`~redig.pace.Paced`: ``stop_speed`` and ``start_speed``
+            times ``pace``, limits of acceleration times ``pace**2``, which is gentle on ice. The gain stays.
 
     Raises:
-        ValueError: for a gain that is not positive, or not ``0 <= stop_speed <= start_speed``.
+        ValueError: for a gain that is not positive, not ``0 <= stop_speed <= start_speed``, or a pace that is not
+            greater than 0 and at most 1.
 
     Examples:
         >>> drive = DifferentialDrive(LIMO)
@@ -114,15 +117,17 @@ class DifferentialDrive:
         reverse: bool = True,
         stop_speed: float = 0.02,
         start_speed: float = 0.05,
+        pace: float = 1.0,
     ) -> None:
         if not 0 < gain < math.inf:
             raise ValueError(f"gain: got {gain}, must be greater than 0")
         if not 0 <= stop_speed <= start_speed < math.inf:
             raise ValueError(f"stop_speed, start_speed: got {stop_speed}, {start_speed}, need 0 <= stop <= start")
         self.base, self.gain, self.reverse = base, gain, reverse
-        self.stop_speed, self.start_speed = stop_speed, start_speed
+        self.stop_speed, self.start_speed = pace * stop_speed, pace * start_speed
+        self._acceleration = check_pace(pace) ** 2 * base.max_linear_acceleration
         # of the wheels, too: then a turn can always go first
-        self._turn_acceleration = min(base.max_angular_acceleration, 2 * base.max_linear_acceleration / base.track)
+        self._turn_acceleration = min(pace**2 * base.max_angular_acceleration, 2 * self._acceleration / base.track)
         self.stop()
 
     def stop(self) -> tuple[float, float]:
@@ -186,7 +191,7 @@ class DifferentialDrive:
     def _within_limits(self, linear: float, angular: float, dt: float) -> tuple[float, float]:
         base = self.base
         angular = _towards(self._angular, angular, self._turn_acceleration * dt)
-        linear = _towards(self._linear, linear, base.max_linear_acceleration * dt)
+        linear = _towards(self._linear, linear, self._acceleration * dt)
         room = base.max_linear - abs(angular) * base.track / 2  # shrinks no faster than the base can brake
         return max(-room, min(linear, room)), angular
 

@@ -7,6 +7,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
+VELOCITY = slice(2, 4)  # where an observation has it
 LARGEST = 1e6  # m, m/s: float32 holds positions of up to here to 6 cm, and nothing that drives is farther or faster
 
 Vector = tuple[float, float]
@@ -96,3 +97,18 @@ def _is_finite(value: Any) -> bool:
         return not isinstance(value, bool | str | bytes) and math.isfinite(value)
     except (TypeError, OverflowError):  # no number; an integer that no float can hold
         return False
+
+
+def check_pace(pace: float) -> float:
+    """The same, if it can be a pace.
+
+    Raises:
+        ValueError: if it is not greater than 0 and at most 1.
+
+    Examples:
+        >>> check_pace(0.5)
+        0.5
+    """
+    if not 0 < pace <= 1:
+        raise ValueError(f"pace: got {pace}, must be greater than 0 and at most 1")
+    return pace

@@ -9,7 +9,7 @@ from typing import Any, Protocol
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from redig.deploy.messages import RobotState
+from redig.deploy.messages import VELOCITY, RobotState, check_pace
 
 WIDTHS = (7, 9)  # of an observation: without and with the direction to the nearest obstacle
 
@@ -43,6 +43,7 @@ class RobotPolicy:
             ``.safetensors`` as written by :func:`~redig.policy.save_policy`, which does, and is run with its own
             sampler and without noise; or an :class:`~redig.deploy.ExportedPolicy` or
             :class:`~redig.deploy.ModulePolicy` that was loaded with other options.
+        pace: drive in slow motion, see :class:`~redig.pace.Paced`; the same for the whole team.
 
     Attributes:
         network: what it runs.
@@ -52,7 +53,7 @@ class RobotPolicy:
     Raises:
         FileNotFoundError: if there is no such file.
         ValueError: if it is neither kind of file, is damaged, or is not a policy of one robot that reads the
-            scenario's observations.
+            scenario's observations; for a pace that is not greater than 0 and at most 1.
 
     Examples:
         >>> import tempfile
@@ -67,7 +68,8 @@ class RobotPolicy:
         ((2,), (2,))
     """
 
-    def __init__(self, policy: str | Path | _Network) -> None:
+    def __init__(self, policy: str | Path | _Network, pace: float = 1.0) -> None:
+        self.pace = check_pace(pace)
         self.network = _load(policy) if isinstance(policy, str | Path) else policy
         self.config, self.environment = self.network.config, self.network.environment
         if not self.network.ego:
@@ -107,7 +109,8 @@ class RobotPolicy:
                 raise ValueError(f"neighbours: got more than one state of {state.robot}, must be one a robot")
             seen.add(state.robot)
         observation = np.array([state.observation() for state in states], np.float32)
-        return self.network(observation[:, : self.network.width], latent=latent, noise=noise)
+        observation[:, VELOCITY] /= self.pace
+        return self.pace * self.network(observation[:, : self.network.width], latent=latent, noise=noise)
 
 
 def _load(path: str | Path) -> _Network:

@@ -15,7 +15,7 @@ class VelocityCommand(Dynamics):
 
     Args:
         dt: time step (s).
-        max_speed: limit on the norm of the command, one for all or each environment's own ``[B, 1]`` (m/s).
+        max_speed: limit on the norm of the command (m/s).
 
     Attributes:
         acceleration: a limit of each environment's own beside that of ``max_f``, ``[B, 1]`` (m/s²), or ``None``.
@@ -33,7 +33,7 @@ class VelocityCommand(Dynamics):
         tensor([[0.1200, 0.1600]])
     """
 
-    def __init__(self, dt: float, max_speed: float | Tensor) -> None:
+    def __init__(self, dt: float, max_speed: float) -> None:
         super().__init__()
         self.dt = dt
         self.max_speed = max_speed

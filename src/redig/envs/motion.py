@@ -23,10 +23,6 @@ class Motion:
         max_acceleration: (m/s²).
         acceleration_range: smallest and largest factor on ``max_acceleration``; ``None``: 1.
         turn_gain: slowest and fastest turn (1/s) of :class:`~redig.envs.turning.TurningCommand`; ``None``: points.
-        speed_range: smallest and largest factor on ``max_speed``; ``None``: 1.
-
-    Attributes:
-        speed: the limit that each team has now, ``[B, 1]`` (m/s).
 
     Raises:
         ValueError: for a range that is not one, or a factor above 1.
@@ -49,29 +45,25 @@ class Motion:
         max_acceleration: float,
         acceleration_range: Range = None,
         turn_gain: Range = None,
-        speed_range: Range = None,
     ) -> None:
-        for name, factors in (("acceleration_range", acceleration_range), ("speed_range", speed_range)):
-            low, high = factors or (1, 1)
-            if not 0 < low <= high <= 1:
-                raise ValueError(f"{name}: got {factors}, must be 0 < low <= high <= 1")
+        low, high = acceleration_range or (1, 1)
+        if not 0 < low <= high <= 1:
+            raise ValueError(f"acceleration_range: got {acceleration_range}, must be 0 < low <= high <= 1")
         slowest, fastest = turn_gain or (1, 1)
         if not 0 < slowest <= fastest < float("inf"):
             raise ValueError(f"turn_gain: got {turn_gain}, must be 0 < slowest <= fastest (1/s)")
         self.max_acceleration, self.acceleration_range, self.turn_gain = max_acceleration, acceleration_range, turn_gain
-        self.max_speed, self.speed_range = max_speed, speed_range
-        self.speed = torch.full((batch_dim, 1), float(max_speed), device=device)
         self.acceleration = torch.full((batch_dim, 1), float(max_acceleration), device=device)
         self.gain = torch.zeros(batch_dim, 1, device=device)
         self.heading = torch.zeros(batch_dim, n_robots, 1, device=device)
-        self.robots = [self._robot(i, dt) for i in range(n_robots)]
+        self.robots = [self._robot(i, dt, max_speed) for i in range(n_robots)]
 
-    def _robot(self, i: int, dt: float) -> VelocityCommand:
+    def _robot(self, i: int, dt: float, max_speed: float) -> VelocityCommand:
         if self.turn_gain is not None:
-            wheeled = TurningCommand(dt, self.speed, self.gain, self.acceleration)
+            wheeled = TurningCommand(dt, max_speed, self.gain, self.acceleration)
             wheeled.heading = self.heading[:, i]
             return wheeled
-        point = VelocityCommand(dt, self.max_speed if self.speed_range is None else self.speed)
+        point = VelocityCommand(dt, max_speed)
         point.acceleration = None if self.acceleration_range is None else self.acceleration
         return point
 
@@ -84,15 +76,13 @@ class Motion:
         """New limits for some teams ``[b]``, whose robots head as said ``[b, n]`` (rad)."""
         if self.acceleration_range is not None:
             self.acceleration[index] = self.max_acceleration * _drawn(self.acceleration[index], self.acceleration_range)
-        if self.speed_range is not None:
-            self.speed[index] = self.max_speed * _drawn(self.speed[index], self.speed_range)
         if self.turn_gain is not None:
             self.gain[index] = _drawn(self.gain[index], self.turn_gain)
             self.heading[index] = heading.unsqueeze(-1)
 
     @property
     def _state(self) -> tuple[str, ...]:
-        return ("acceleration", "speed", *(() if self.turn_gain is None else ("gain", "heading")))
+        return ("acceleration",) if self.turn_gain is None else ("acceleration", "gain", "heading")
 
     def state_dict(self) -> dict[str, Tensor]:
         """What the next step depends on."""

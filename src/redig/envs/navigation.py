@@ -38,10 +38,9 @@ class FormationNavigation(BaseScenario):
       ``corridor_angle``; on a map with a route, its ends say where both are and how they head. ``position_jitter`` (m)
       and ``heading_jitter`` (rad): half ranges of what is added to each.
     * ``radius`` (m), ``max_speed`` (m/s), ``max_acceleration`` (m/s²), ``dt`` (s): the robots. ``acceleration_range``:
-      smallest and largest factor on ``max_acceleration``, drawn for each team at its reset; ``None``: 1.
-      ``speed_range``: the same of ``max_speed``, to which the robots shorten commands, whatever a policy may ask for.
-      ``turn_gain``: slowest and fastest turn towards commands (1/s), drawn likewise, of robots with wheels that start
-      facing their goals, see :class:`~redig.envs.TurningCommand`; ``None``: points that move in any direction at once.
+      smallest and largest factor on ``max_acceleration``, drawn for each team at its reset; ``None``: 1. ``turn_gain``:
+      slowest and fastest turn towards commands (1/s), drawn likewise, of robots with wheels that start facing their
+      goals, see :class:`~redig.envs.TurningCommand`; ``None``: points that move in any direction at once.
     * ``observe_direction``: add the unit vector to the nearest obstacle (9 numbers); ``False`` gives the paper's 7.
     * ``formation_reward``: one of ``spring_damper`` (Eq. 29), ``spring_damper_bonus``, ``scaled``, ``slanted``,
       ``integrity``, ``none``; ``formation_weight``; ``omega``. The frame of ``scaled`` and ``slanted`` is the goal's
@@ -83,9 +82,8 @@ class FormationNavigation(BaseScenario):
         self.offsets = offsets.to(device)
         self.desired = pairwise_distances(self.offsets)
         self.obstacle_map = self.obstacle_map.to(device)
-        limits = self.dt, self.max_speed, self.max_acceleration
-        ranges = self.acceleration_range, self.turn_gain, self.speed_range
-        self.motion = Motion(self.n_robots, batch_dim, device, *limits, *ranges)
+        limits = self.dt, self.max_speed, self.max_acceleration, self.acceleration_range, self.turn_gain
+        self.motion = Motion(self.n_robots, batch_dim, device, *limits)
         world = World(batch_dim, device, dt=self.dt, drag=0.0)
         for i in range(self.n_robots):
             world.add_agent(
@@ -124,7 +122,6 @@ class FormationNavigation(BaseScenario):
         self.radius, self.dt = take("radius", 0.1), take("dt", 0.1)
         self.max_speed, self.max_acceleration = take("max_speed", 1.0), take("max_acceleration", 2.0)
         self.acceleration_range, self.turn_gain = take("acceleration_range", None), take("turn_gain", None)
-        self.speed_range = take("speed_range", None)
         self.observe_direction = take("observe_direction", True)
         self.formation_reward = take("formation_reward", "spring_damper")
         self.formation_weight, self.omega = take("formation_weight", 1.0), take("omega", 0.5)

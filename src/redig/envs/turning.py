@@ -22,7 +22,7 @@ class TurningCommand(VelocityCommand):
 
     Args:
         dt: time step (s).
-        max_speed: limit on the norm of the command, one for all or each environment's own ``[B, 1]`` (m/s).
+        max_speed: limit on the norm of the command (m/s).
         gain: how fast the angle is closed, of each environment ``[B, 1]`` (1/s).
         acceleration: limit along the heading, of each environment ``[B, 1]`` (m/s²).
         max_turn: fastest turn (rad/s).
@@ -46,9 +46,7 @@ class TurningCommand(VelocityCommand):
 
     acceleration: Tensor
 
-    def __init__(
-        self, dt: float, max_speed: float | Tensor, gain: Tensor, acceleration: Tensor, max_turn: float = 6.0
-    ) -> None:
+    def __init__(self, dt: float, max_speed: float, gain: Tensor, acceleration: Tensor, max_turn: float = 6.0) -> None:
         super().__init__(dt, max_speed)
         self.gain, self.acceleration, self.max_turn = gain, acceleration, max_turn
         self.heading = torch.zeros_like(gain)

@@ -33,7 +33,7 @@ class PhysicsNavigation(FormationNavigation):
     * ``body`` (:class:`~redig.physics.RobotBody`), of the scenario's ``radius``; ``ground``
       (:class:`~redig.physics.Ground`).
     * ``base`` (:class:`~redig.deploy.drive.Base`): limits of the drive; default: see :func:`base_of`. ``gain`` (1/s):
-      how fast it turns. ``drive_interval`` (s): between two of its commands.
+      how fast it turns. ``pace``: of the drive. ``drive_interval`` (s): between two of its commands.
 
     ``acceleration_range`` and ``turn_gain`` of the scenario mean nothing here: motors, grip and drive decide that.
 
@@ -52,7 +52,7 @@ class PhysicsNavigation(FormationNavigation):
     def make_world(self, batch_dim: int, device: torch.device, **kwargs) -> World:
         """Build the team and its map in both simulators (called by VMAS)."""
         body, ground = kwargs.pop("body", None), kwargs.pop("ground", None)
-        base, gain = kwargs.pop("base", None), kwargs.pop("gain", 8.0)
+        base, gain, pace = kwargs.pop("base", None), kwargs.pop("gain", 8.0), kwargs.pop("pace", 1.0)
         self.drive_interval = kwargs.pop("drive_interval", 0.02)
         world = super().make_world(batch_dim, device, **kwargs)
         self.drive_calls = round(self.dt / self.drive_interval)
@@ -64,7 +64,9 @@ class PhysicsNavigation(FormationNavigation):
         base = base or base_of(body, self.max_speed, self.max_acceleration)
         maps = [map_at(self.obstacle_map, i) for i in range(batch_dim)]
         self.teams = [PhysicsWorld(boxes(each), self.n_robots, body, ground) for each in maps]
-        self.drives = [[DifferentialDrive(base, gain=gain) for _ in range(self.n_robots)] for _ in range(batch_dim)]
+        self.drives = [
+            [DifferentialDrive(base, gain=gain, pace=pace) for _ in range(self.n_robots)] for _ in range(batch_dim)
+        ]
         return world
 
     def reset_world_at(self, env_index: int | None = None) -> None:
@@ -89,7 +91,7 @@ class PhysicsNavigation(FormationNavigation):
     def _settle(self) -> tuple[Tensor, Tensor, Tensor]:
         """Let MuJoCo carry out the commands from where it was; what VMAS made of them is replaced."""
         action = torch.stack([agent.action.u for agent in self.world.agents], 1)
-        command = limit_norm(action, self.motion.speed.unsqueeze(1)).double().cpu().numpy()
+        command = limit_norm(action, self.max_speed).double().cpu().numpy()
         touched = np.stack([self._drive(*each) for each in zip(self.teams, self.drives, command, strict=True)])
         position = self.goal.new_tensor(np.stack([team.position for team in self.teams]))
         velocity = self.goal.new_tensor(np.stack([team.velocity for team in self.teams]))

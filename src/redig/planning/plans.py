@@ -87,7 +87,7 @@ def plan_alone(
         start: ``[E, n, 2]`` (m).
         goal: ``[E, n, 2]`` (m).
         planner: ``"astar"`` or ``"rrt"``.
-        speed: lowest and highest (m/s); robots that are slower themselves get their own.
+        speed: lowest and highest (m/s).
         generator: of the speeds.
         seed: of RRT.
         report: called with the number of each team that is planned for.
@@ -115,7 +115,7 @@ def plan_alone(
             report(i // n)
     own_speed = torch.empty(num_envs, n, device=start.device).uniform_(*speed, generator=generator)
     plans = pad_paths(paths).to(start.device).unflatten(0, (num_envs, n))
-    return PathTracker(plans, own_speed.minimum(scenario.motion.speed), scenario.max_acceleration, scenario.dt)
+    return PathTracker(plans, own_speed, scenario.max_acceleration, scenario.dt)
 
 
 def plan_together(
@@ -141,7 +141,6 @@ def plan_together(
     """
     structure_of = team_structures(scenario, clearance=CLEARANCE)
     team_speed = torch.empty(len(start), device=start.device).uniform_(*speed, generator=generator)
-    team_speed = team_speed.minimum(scenario.motion.speed.squeeze(-1))
     references = []
     for i, (a, b, limit) in enumerate(zip(start.cpu(), goal.cpu(), team_speed.tolist(), strict=True)):
         references.append(structure_of(i)(a, b, limit, scenario.max_acceleration, scenario.dt))
