@@ -45,7 +45,7 @@ class Arguments:
     cases: tuple[str, ...] = CASES
     """What to compare: names as in the table."""
     pace: float = 1.0
-    """Drive in slow motion: 0.5 takes twice the time (redig.Paced)."""
+    """Drive in slow motion: 0.5 takes twice the time (redig.pace.Paced)."""
     out: Path = Path("runs/mujoco")
     """Folder of FORMATION.csv and the pictures."""
     film: Literal["render", "plan", "none"] = "plan"
