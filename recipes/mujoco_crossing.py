@@ -153,11 +153,12 @@ def main(arguments: Arguments) -> list[dict[str, Any]]:
     arguments.out.mkdir(parents=True, exist_ok=True)
     shown = [{k: f"{v:.6g}" if isinstance(v, float) else v for k, v in row.items()} for row in rows]
     write_csv(arguments.out / f"{formation}.csv", shown)
-    env = case("MuJoCo", scenario, 1, arguments.pace)
-    if arguments.film == "render":
-        film(arguments.out / f"{formation}.mp4", policy, env, arguments.seed)
-    elif arguments.film == "plan":
-        draw_crossing(arguments.out, policy, env, arguments.seed, f"{formation}.mp4")
+    if arguments.film != "none":
+        env = case("MuJoCo", scenario, 1, arguments.pace)
+        if arguments.film == "render":
+            film(arguments.out / f"{formation}.mp4", policy, env, arguments.seed)
+        else:
+            draw_crossing(arguments.out, policy, env, arguments.seed, f"{formation}.mp4")
     print(f"written to {arguments.out}")
     return rows
 

@@ -92,6 +92,7 @@ class RayCollection(Iterator[TensorDictBase]):
 
     def __next__(self) -> TensorDictBase:
         """A batch; workers that are lost meanwhile are replaced first."""
+        import ray
         from ray.exceptions import RayActorError, RayTaskError
 
         for attempt in range(self.ATTEMPTS):
@@ -106,9 +107,10 @@ class RayCollection(Iterator[TensorDictBase]):
                 if attempt + 1 == self.ATTEMPTS:
                     raise
                 warnings.warn(f"lost a worker, all are started again: {error}", stacklevel=2)
-                if isinstance(error, TimeoutError):
-                    self._connect(again=True)
                 self.shutdown()
+                if isinstance(error, TimeoutError):  # with the connection end the workers that do not answer
+                    ray.shutdown()
+                    self._connect()
                 self.restarts += 1
         raise AssertionError("unreachable")
 
@@ -118,12 +120,9 @@ class RayCollection(Iterator[TensorDictBase]):
             self.collector.shutdown()
             self.collector = None
 
-    def _connect(self, again: bool = False) -> None:
-        """Connect to the cluster; ``again``: leave it first, with which it stops all workers of this process."""
+    def _connect(self) -> None:
         import ray
 
-        if again:
-            ray.shutdown()
         local: dict[str, Any] = (
             {"num_cpus": self.num_workers, "include_dashboard": False} if self.address == "local" else {}
         )
