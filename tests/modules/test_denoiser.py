@@ -7,7 +7,7 @@ from hypothesis import strategies as st
 from torch import nn
 
 from redig.modules import DenoisingMLP
-from redig.modules.denoiser import mlp, quick_mish_, quick_mish_pays, sinusoidal_embedding
+from redig.modules.denoiser import mlp, quick_mish_, quick_mish_pays, rows_at_once, sinusoidal_embedding
 
 
 @settings(deadline=None)
@@ -170,3 +170,14 @@ def test_a_large_batch_without_gradients_has_the_same_values():
         assert quick_mish_pays(torch.zeros(300, 64))
         found = denoiser.prepare(embedding, [3])(action, 3)
     torch.testing.assert_close(found, expected, atol=1e-6, rtol=0)
+
+
+@pytest.mark.parametrize("activation", ["mish", "relu"])
+def test_a_batch_taken_in_pieces_has_the_same_values(activation):
+    torch.manual_seed(0)
+    denoiser = DenoisingMLP(2, 6, (128, 64), activation=activation)
+    action, embedding = torch.randn(1001, 5, 2), torch.randn(1001, 5, 6)
+    with torch.no_grad():
+        assert rows_at_once(torch.zeros(1001, 5, 128)) == 2048  # 5005 rows: two whole pieces and a rest
+        found = denoiser.prepare(embedding, [3])(action, 3)
+        torch.testing.assert_close(found, denoiser(action, torch.tensor(3), embedding), atol=1e-6, rtol=0)

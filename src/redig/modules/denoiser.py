@@ -91,9 +91,27 @@ def quick_mish_pays(x: Tensor) -> bool:
         ...     [quick_mish_pays(torch.zeros(robots, 128)) for robots in (5, 260, 20_480)]
         [False, True, False]
     """
+    return _eager_on_cpu(x) and 2**13 <= x.numel() <= 2**19
+
+
+def rows_at_once(x: Tensor) -> int | None:
+    """How many rows of a large batch to take through a network at a time, to stay in a cache; None: all of them.
+
+    Measured on a CPU in float32: a chain of a million numbers takes half the time in pieces.
+
+    Examples:
+        >>> import torch
+        >>> with torch.no_grad():
+        ...     [rows_at_once(torch.zeros(robots, 128)) for robots in (5, 20_480)]
+        [None, 2048]
+    """
+    return 2**18 // x.shape[-1] if _eager_on_cpu(x) and x.numel() > 2**19 and x.shape[-1] <= 2**18 else None
+
+
+def _eager_on_cpu(x: Tensor) -> bool:
     if torch.is_grad_enabled() or torch.compiler.is_compiling() or torch.compiler.is_exporting():
         return False
-    return x.device.type == "cpu" and x.dtype == torch.float32 and 2**13 <= x.numel() <= 2**19
+    return x.device.type == "cpu" and x.dtype == torch.float32
 
 
 def check_shapes(action: Tensor, action_dim: int, embedding: Tensor, embedding_dim: int) -> None:
@@ -204,13 +222,19 @@ class DenoisingMLP(nn.Module):
         every = torch.arange(max(steps) + 1, device=embedding.device)  # no copy from the host, for CUDA graphs
         shift = nn.functional.linear(sinusoidal_embedding(every.float(), self.step_dim).to(dtype), of_time)
         base = nn.functional.linear(embedding.to(dtype), of_embedding, first.bias)
-        if quick_mish_pays(base):
+        rows = rows_at_once(base)
+        pieces = (base,) if rows is None else base.flatten(0, -2).split(rows)
+        if quick_mish_pays(pieces[0]):
             rest = [quick_mish_ if isinstance(layer, nn.Mish) else layer for layer in rest]
 
         def denoise(action: Tensor, step: int) -> Tensor:
-            hidden = nn.functional.linear(action.to(dtype), of_action, shift[step]) + base
-            for layer in rest:
-                hidden = layer(hidden)
-            return hidden
+            actions = (action,) if rows is None else action.flatten(0, -2).split(rows)
+            noise = []
+            for some, share in zip(actions, pieces, strict=True):
+                hidden = nn.functional.linear(some.to(dtype), of_action, shift[step]) + share
+                for layer in rest:
+                    hidden = layer(hidden)
+                noise.append(hidden)
+            return noise[0] if rows is None else torch.cat(noise).reshape(action.shape)
 
         return denoise
