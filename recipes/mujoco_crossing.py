@@ -7,7 +7,6 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Literal
 
-import imageio.v2 as imageio
 import mujoco
 import tyro
 from evaluate import draw_crossing
@@ -18,10 +17,11 @@ from torch import Tensor
 from redig.deploy.drive import LIMO
 from redig.envs.factory import make_env
 from redig.evaluation import rollout_trajectories, team_metrics
-from redig.files import replacing, write_csv
+from redig.files import write_csv
 from redig.pace import Paced
 from redig.physics import Ground, PhysicsNavigation, RobotBody
 from redig.policy import load_policy, read_header
+from redig.viz.animation import write_film
 
 SHOWN = (
     "success_rate", "team_success_rate", "travel_time", "cfi_0.5", "cfi_0.1", "cfi_0.03", "jerk_mean", "collision_rate",
@@ -133,8 +133,7 @@ def film(path: Path, policy: TensorDictModuleBase, env: Any, seed: int) -> None:
     rollout_trajectories(policy, env, seed)
     hook.remove()
     renderer.close()
-    with replacing(path) as unfinished:
-        imageio.mimwrite(unfinished, frames, fps=round(1 / env.scenario.dt), codec="libx264", macro_block_size=16)
+    write_film(path, frames, round(1 / env.scenario.dt))
 
 
 def main(arguments: Arguments) -> list[dict[str, Any]]:

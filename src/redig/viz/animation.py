@@ -3,10 +3,13 @@
 from __future__ import annotations
 
 import os
+from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
 import imageio.v2 as imageio
+from numpy.typing import NDArray
+from PIL import Image
 from torch import Tensor
 
 from redig.envs.maps import ObstacleMap
@@ -56,24 +59,32 @@ def animate(
         raise ValueError(f"fps: got {fps}, must be at least 1")
     track, goals = check_trajectory(position, goal)
     canvas = TeamCanvas(view(track, goals), track.shape[1], formation, obstacle_map, goals, radius)
-    with replacing(path) as unfinished, film_writer(unfinished, fps) as writer:
-        for k in range(len(track)):
-            writer.append_data(canvas.draw(track[: k + 1], k * dt))
+    write_film(path, (canvas.draw(track[: k + 1], k * dt) for k in range(len(track))), fps)
 
 
-def film_writer(path: Path, fps: int) -> Any:
-    """A writer of frames ``[H, W, 3]`` (uint8) into a GIF or MP4; the sides of an MP4 must be multiples of 16.
+def write_film(path: Path, frames: Iterable[NDArray], fps: int) -> None:
+    """Write frames ``[H, W, 3]`` (uint8) into a GIF or MP4, which replaces an existing file at once.
+
+    The colours of a GIF are those of its first frame; the sides of an MP4 must be multiples of 16.
 
     Examples:
         >>> import tempfile
         >>> import numpy as np
         >>> with tempfile.TemporaryDirectory() as folder:
         ...     path = Path(folder, "film.gif")
-        ...     with film_writer(path, fps=10) as writer:
-        ...         writer.append_data(np.zeros((16, 16, 3), dtype=np.uint8))
+        ...     write_film(path, [np.zeros((16, 16, 3), dtype=np.uint8)], fps=10)
         ...     len(imageio.mimread(path))
         1
     """
-    if path.suffix.lower() == ".gif":
-        return imageio.get_writer(path, mode="I", duration=1000 / fps, loop=0, subrectangles=True)
-    return imageio.get_writer(path, mode="I", fps=fps, codec="libx264", macro_block_size=BLOCK)
+    with replacing(path) as unfinished:
+        if path.suffix.lower() != ".gif":
+            writer: Any = imageio.get_writer(unfinished, mode="I", fps=fps, codec="libx264", macro_block_size=BLOCK)
+            with writer:
+                for frame in frames:
+                    writer.append_data(frame)
+            return
+        # one palette for all: to find each frame its own takes longer than to draw it
+        pictures = (Image.fromarray(frame) for frame in frames)
+        first = next(pictures).quantize(method=Image.Quantize.FASTOCTREE)  # which leaves white white
+        others = (picture.quantize(palette=first, dither=Image.Dither.NONE) for picture in pictures)
+        first.save(unfinished, format="GIF", save_all=True, append_images=others, duration=1000 / fps, loop=0)

@@ -3,18 +3,18 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from typing import Any
 
 import numpy as np
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
+from numpy.typing import NDArray
 from torch import Tensor
 
 from redig.envs.maps import ObstacleMap
 from redig.envs.occupancy import OccupancyMap
-from redig.files import replacing
-from redig.viz.animation import film_writer
+from redig.viz.animation import write_film
 from redig.viz.canvas import BLOCK, DPI
 from redig.viz.denoising import check_chain
 from redig.viz.scene import INK, VIDEO_SUFFIXES, check_suffix, check_trajectory, draw_map, robot_style, view
@@ -86,7 +86,8 @@ def animate_denoising(
     canvas.draw()
     figure.set_layout_engine("none")  # it stays as it is
     clock = axes.text(0.01, 0.98, "", transform=axes.transAxes, size=8, color=INK, va="top")
-    with replacing(path) as unfinished, film_writer(unfinished, fps) as writer:
+
+    def frames() -> Iterator[NDArray]:
         for step, ends in zip(steps, tips, strict=True):
             for i, (cloud, arrow) in enumerate(zip(dots, arrows, strict=True)):
                 cloud.set_offsets(ends[:, i])
@@ -94,5 +95,6 @@ def animate_denoising(
             clock.set_text(f"diffusion step k = {step}")
             canvas.draw()
             frame = np.asarray(canvas.buffer_rgba())[..., :3].copy()
-            for _ in range(max(round(hold * fps), 1) if step == steps[-1] else 1):
-                writer.append_data(frame)
+            yield from [frame] * (max(round(hold * fps), 1) if step == steps[-1] else 1)
+
+    write_film(path, frames(), fps)
