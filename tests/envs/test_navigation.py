@@ -6,8 +6,8 @@ import torch
 from torchrl.envs import check_env_specs
 
 from redig.envs import curve, formation_offsets, make_env, pairwise_distances
+from redig.envs.formation_reward import FORMATION_REWARDS
 from redig.envs.maps import ObstacleMap
-from redig.envs.navigation import FORMATION_REWARDS
 
 PARTS = ("navigation_reward", "formation_reward", "arrival_reward", "collision_reward")
 

@@ -9,6 +9,7 @@ from vmas.simulator.scenario import BaseScenario
 
 from redig.envs import rewards, starts
 from redig.envs.dynamics import leave_walls, part_robots
+from redig.envs.formation_reward import FORMATION_REWARDS, formation_reward
 from redig.envs.formations import formation_offsets, pairwise_distances
 from redig.envs.map_batch import AnyMap, check_map, map_at
 from redig.envs.maps import corridor
@@ -16,7 +17,6 @@ from redig.envs.motion import Motion
 from redig.envs.random_maps import named_map
 from redig.envs.routes import turned_along
 
-FORMATION_REWARDS = ("spring_damper", "spring_damper_bonus", "scaled", "slanted", "integrity", "none")
 NAVIGATION_REWARDS = ("goal_speed", "progress")
 
 
@@ -80,7 +80,6 @@ class FormationNavigation(BaseScenario):
         self._read_arguments(kwargs, batch_dim)
         offsets = formation_offsets(self.formation, self.n_robots, self.formation_width)
         self.offsets = offsets.to(device)
-        self.desired = pairwise_distances(self.offsets)
         self.obstacle_map = self.obstacle_map.to(device)
         limits = self.dt, self.max_speed, self.max_acceleration, self.acceleration_range, self.turn_gain
         self.motion = Motion(self.n_robots, batch_dim, device, *limits)
@@ -218,9 +217,11 @@ class FormationNavigation(BaseScenario):
             navigation = rewards.progress(self.previous_position, position, self.goal, self.dt)
         else:
             navigation = rewards.goal_speed(position, velocity, self.goal)
+        shape = self.offsets, self._travel_direction(position), self.omega
+        bonus = formation_reward(self.formation_reward, self.formation, position, velocity, *shape)
         parts = {
             "navigation_reward": navigation * moving,
-            "formation_reward": self._formation_reward(position, velocity),
+            "formation_reward": self.formation_weight * bonus,
             "arrival_reward": self.arrival_bonus * arriving,
             "collision_reward": -self.collision_penalty * collision
             - self.proximity_penalty * rewards.proximity(free, self.proximity_margin),
@@ -242,24 +243,6 @@ class FormationNavigation(BaseScenario):
     def _place(self, position: Tensor, velocity: Tensor) -> None:
         for i, agent in enumerate(self.world.agents):
             agent.state.pos, agent.state.vel = position[:, i], velocity[:, i]
-
-    def _formation_reward(self, position: Tensor, velocity: Tensor) -> Tensor:
-        if self.formation_reward == "scaled":
-            bonus = rewards.scaled_formation_bonus(position, self.offsets, self._travel_direction(position))
-        elif self.formation_reward == "slanted":
-            bonus = rewards.slanted_formation_bonus(position, self.offsets, self._travel_direction(position))
-        elif self.formation_reward == "integrity":
-            direction = self._travel_direction(position)
-            team = rewards.integrity_bonus(self.formation, position, self.offsets, direction)
-            bonus = team.unsqueeze(-1).expand(-1, self.n_robots)
-        elif self.formation_reward == "spring_damper_bonus":
-            bonus = rewards.spring_damper_bonus(position, velocity, self.desired, self.omega)
-        elif self.formation_reward == "spring_damper":
-            team = rewards.spring_damper(position, velocity, self.desired, self.omega)
-            bonus = team.unsqueeze(-1).expand(-1, self.n_robots)
-        else:
-            bonus = position.new_zeros(position.shape[:2])
-        return self.formation_weight * bonus
 
     def _travel_direction(self, position: Tensor) -> Tensor:
         """Where a formation should head ``[B, 2]``: as at the goal, less what the route still turns until there."""
