@@ -65,6 +65,8 @@ class Task:
     """Balance of spring and damper in the spring-damper forms (paper: 0.5)."""
     navigation_reward: str = "progress"
     """progress or goal_speed (Eq. 30)."""
+    time_cost: float = 0.0
+    """What each step costs a robot until it arrives, beside progress in m/s: it hurries a team (paper: none)."""
     arrival_bonus: float | None = None
     """Paid once to a robot on arrival (paper: 15); default: what suits the formation."""
     collision_penalty: float = 20.0
@@ -99,8 +101,8 @@ class Task:
         names = (
             "formation", "n_robots", "formation_width", "corridor_width", "corridor_length", "max_speed",
             "max_acceleration", "observe_direction", "formation_reward", "formation_weight", "omega",
-            "navigation_reward", "arrival_bonus", "collision_penalty", "proximity_penalty", "collision_terminates",
-            "arrival_terminates",
+            "navigation_reward", "time_cost", "arrival_bonus", "collision_penalty", "proximity_penalty",
+            "collision_terminates", "arrival_terminates",
         )  # fmt: skip
         arguments = {name: getattr(self, name) for name in names}
         if self.map != "corridor":

@@ -114,6 +114,10 @@ def test_reward_weights_and_variants_against_positions_and_velocities():
     info = rollout(navigation_reward="progress")
     gained = (info["navigation_reward"] * 0.1).sum(1)
     assert ((gained > 0.4) & (gained <= 0.5)).all()  # half a metre, less what is left at arrival
+    costly = rollout(navigation_reward="progress", time_cost=0.5)
+    assert info["arrived"].any()
+    moving = 1 - info["arrived"].roll(1, 1).index_fill(1, torch.tensor([0]), 0)
+    torch.testing.assert_close(costly["navigation_reward"], info["navigation_reward"] - 0.5 * moving)
 
 
 def test_the_arrival_bonus_is_paid_once_and_the_robot_then_holds_whatever_its_command():

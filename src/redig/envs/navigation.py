@@ -48,8 +48,9 @@ class FormationNavigation(BaseScenario):
       turns between the team's centroid and the goal, so that a team is squeezed across the path wherever it is; on a
       straight one that is nothing. The contextual formation integrity has no frame.
     * ``navigation_reward``: ``goal_speed`` (Eq. 30) or ``progress``, both as the crow flies: along an arc of less than
-      half a circle every step still pays; ``arrival_bonus``, ``goal_radius`` (m);
-      ``collision_penalty``; ``proximity_penalty`` and ``proximity_margin`` (m), a ramp before contact.
+      half a circle every step still pays; ``time_cost``, taken from it at each step until the robot arrives;
+      ``arrival_bonus``, ``goal_radius`` (m); ``collision_penalty``; ``proximity_penalty`` and ``proximity_margin``
+      (m), a ramp before contact.
     * ``collision_terminates``, ``arrival_terminates``: what ends the task of one robot (``info["terminated"]``).
     * ``hold_steps``: steps for which the team holds at its goals before the episode ends.
 
@@ -125,6 +126,7 @@ class FormationNavigation(BaseScenario):
         self.formation_reward = take("formation_reward", "spring_damper")
         self.formation_weight, self.omega = take("formation_weight", 1.0), take("omega", 0.5)
         self.navigation_reward = take("navigation_reward", "goal_speed")
+        self.time_cost = take("time_cost", 0.0)
         self.arrival_bonus, self.goal_radius = take("arrival_bonus", 15.0), take("goal_radius", 0.1)
         self.collision_penalty = take("collision_penalty", 1.5)
         self.proximity_penalty, self.proximity_margin = take("proximity_penalty", 0.0), take("proximity_margin", 0.1)
@@ -220,7 +222,7 @@ class FormationNavigation(BaseScenario):
         shape = self.offsets, self._travel_direction(position), self.omega
         bonus = formation_reward(self.formation_reward, self.formation, position, velocity, *shape)
         parts = {
-            "navigation_reward": navigation * moving,
+            "navigation_reward": (navigation - self.time_cost) * moving,
             "formation_reward": self.formation_weight * bonus,
             "arrival_reward": self.arrival_bonus * arriving,
             "collision_reward": -self.collision_penalty * collision
