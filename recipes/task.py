@@ -66,7 +66,8 @@ class Task:
     navigation_reward: str = "progress"
     """progress or goal_speed (Eq. 30)."""
     time_cost: float = 0.0
-    """What each step costs a robot until it arrives, beside progress in m/s: it hurries a team (paper: none)."""
+    """What each step costs a robot until it arrives, against progress in m/s: it hurries a team. Keep it well below
+    the formation's weight, or a robot gains by ending it all in a collision (paper: none)."""
     arrival_bonus: float | None = None
     """Paid once to a robot on arrival (paper: 15); default: what suits the formation."""
     collision_penalty: float = 20.0
