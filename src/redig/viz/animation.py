@@ -63,7 +63,7 @@ def animate(
 
 
 def write_film(path: Path, frames: Iterable[NDArray], fps: int) -> None:
-    """Write frames ``[H, W, 3]`` (uint8) into a GIF or MP4, which replaces an existing file at once.
+    """Write one frame ``[H, W, 3]`` (uint8) or more into a GIF or MP4, which replaces an existing file at once.
 
     The colours of a GIF are those of its first frame; the sides of an MP4 must be multiples of 16.
 
