@@ -25,7 +25,7 @@ COORDINATED: dict[str, Any] = {  # what suits demonstrations worth keeping to: s
 SMOKE: dict[str, Any] = {  # the whole program in under a minute; it learns nothing
     "num_trajectories": 100, "clone_updates": 20, "critic_updates": 20, "warmup_steps": 20, "env_steps": 40,
     "evaluation_interval": 20, "evaluation_starts": 8, "num_starts": 8, "num_envs": 8, "hidden": 32,
-    "diffusion_steps": 5, "sampling_steps": 5,
+    "diffusion_steps": 5, "sampling_steps": 5, "max_steps": 50,
 }  # fmt: skip
 
 
@@ -187,8 +187,8 @@ class Config(Task):
         config = dataclasses.replace(self, **preset).filled(REWARD.get(self.formation, REWARD["wedge"]))
         config.check_positive(
             "num_trajectories", "clone_updates", "clone_batch", "num_envs", "collect_steps", "updates_per_step",
-            "batch_size", "buffer_size", "evaluation_interval", "evaluation_starts", "num_starts", "hidden",
-            "best_of_n", "ray_workers",
+            "batch_size", "buffer_size", "max_steps", "evaluation_interval", "evaluation_starts", "num_starts",
+            "hidden", "best_of_n", "ray_workers",
         )  # fmt: skip
         round_updates = config.collect_steps * config.updates_per_step
         if config.block < 1 or round_updates % config.block:

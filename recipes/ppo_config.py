@@ -17,6 +17,7 @@ METHODS: dict[str, dict[str, Any]] = {
 SMOKE: dict[str, Any] = {  # the whole program in under a minute; it learns nothing
     "num_trajectories": 50, "clone_updates": 4, "frames": 640, "horizon": 20, "epochs": 1, "num_envs": 8,
     "evaluation_interval": 40, "evaluation_starts": 8, "num_starts": 8, "hidden": 32,
+    "max_steps": 50,
 }  # fmt: skip
 
 
@@ -101,7 +102,7 @@ class PPOConfig(Task):
         config = config.filled({"formation_reward": Task.formation_reward})
         config.check_positive(
             "num_envs", "horizon", "epochs", "batch_size", "hidden", "num_trajectories", "clone_batch",
-            "evaluation_interval", "evaluation_starts", "num_starts",
+            "max_steps", "evaluation_interval", "evaluation_starts", "num_starts",
         )  # fmt: skip
         if not 0 <= config.team_share <= 1:
             raise ValueError(f"team_share: got {config.team_share}, must be in [0, 1]")

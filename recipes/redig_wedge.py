@@ -68,9 +68,8 @@ def train(config: Config) -> dict[str, float]:
     same_robots = {**scenario, "turn_gain": config.turn_gain}  # but no delay, noise or weak motors
     demo_env = make_env(min(250, config.num_trajectories), reward_scale=config.reward_scale, **same_robots)
     cache = folder.parent / "demonstrations"
-    episodes = demonstrations(
-        demo_env, config.num_trajectories, config.planner, config.demonstration_speed, seed=config.seed, cache_dir=cache
-    )
+    plans = config.num_trajectories, config.planner, config.demonstration_speed
+    episodes = demonstrations(demo_env, *plans, max_steps=config.max_steps, seed=config.seed, cache_dir=cache)
     demos = transitions(multi_step(episodes)[episodes["mask"]], demonstration=True)
     on_disk = config.buffer_on_disk
     storage = DiskStorage(config.buffer_size, folder / "buffer") if on_disk else LazyTensorStorage(config.buffer_size)

@@ -113,7 +113,7 @@ def measure(
 ) -> dict[str, float]:
     """Metrics of one setting; with ``compare`` also the distance to the full chain and the time of an action."""
     _, scenario = read_header(path)
-    env = make_env(arguments.starts, max_steps=arguments.max_steps, **scenario)
+    env = make_env(arguments.starts, **{**scenario, "max_steps": arguments.max_steps})
     policy = load_policy(path, sampler=sampler, **memory)
     driver: Any = policy if critics is None else BestOfN(policy, load_critics(critics), best_of_n)
     kind = kind or (DETERMINISTIC if compare else RANDOM)

@@ -53,6 +53,8 @@ class Task:
     """Speed limit (m/s)."""
     max_acceleration: float = 2.0
     """Acceleration limit (m/s²)."""
+    max_steps: int = 200
+    """Steps of 0.1 s until a team's episode is cut; a longer map may need more."""
     observe_direction: bool = True
     """Observe the unit vector to the nearest obstacle; without it the state is the paper's seven numbers."""
 
@@ -98,7 +100,7 @@ class Task:
     """Starts of the final evaluation, never trained on and never used for a choice."""
 
     def scenario(self, split: str = "train") -> dict[str, Any]:
-        """Arguments of :class:`redig.envs.FormationNavigation`; random maps are those of a split."""
+        """Arguments of :func:`redig.envs.make_env` that make the task; random maps are those of a split."""
         names = (
             "formation", "n_robots", "formation_width", "corridor_width", "corridor_length", "max_speed",
             "max_acceleration", "observe_direction", "formation_reward", "formation_weight", "omega",
@@ -106,6 +108,8 @@ class Task:
             "collision_terminates", "arrival_terminates",
         )  # fmt: skip
         arguments = {name: getattr(self, name) for name in names}
+        if self.max_steps != Task.max_steps:
+            arguments["max_steps"] = self.max_steps
         if self.map != "corridor":
             arguments["obstacle_map"] = f"{self.map}:{split}" if self.map in MAP_KINDS else self.map
         return arguments

@@ -124,7 +124,9 @@ def demonstration_split(config: Config) -> tuple[TensorDictBase, TensorDictBase]
     """N-step transitions of four fifths of the demonstrated episodes, and of the rest."""
     scenario = config.scenario()
     env = make_env(min(100, config.num_trajectories), reward_scale=config.reward_scale, **scenario)
-    episodes = demonstrations(env, config.num_trajectories, config.planner, seed=config.seed)
+    episodes = demonstrations(
+        env, config.num_trajectories, config.planner, max_steps=config.max_steps, seed=config.seed
+    )
     keep = [OBSERVATION, ACTION, ("agents", "info", "arrived")]
     windows = MultiStep(config.n_steps, config.gamma, keep=keep)(episodes)
     split = len(episodes) * 4 // 5

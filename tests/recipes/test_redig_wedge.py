@@ -17,7 +17,7 @@ from run import Run
 
 from redig.checkpoint import load_checkpoint
 from redig.disk_storage import DiskStorage
-from redig.policy import load_policy
+from redig.policy import load_policy, read_header
 
 METRICS = [
     "success_rate", "team_success_rate", "travel_time", "cfi_0.5", "cfi_0.1", "cfi_0.03", "cfi_literal_0.5",
@@ -54,6 +54,7 @@ def test_a_run_leaves_everything(smoke):
     assert "cloned (before online training)" in printed and "success_rate" in printed
     for name in ("policy", "last", "cloned"):
         assert load_policy(folder / f"{name}.safetensors", observation_dim=9)
+        assert read_header(folder / f"{name}.safetensors")[1]["max_steps"] == SMOKE["max_steps"]
     assert not list(folder.glob(".*tmp*"))
 
 
@@ -178,6 +179,7 @@ def test_a_corrupt_checkpoint_is_named(smoke, tmp_path):
         ({"schedule": "quadratic"}, r"schedule: got 'quadratic'"),
         ({"sampling_steps": 101}, r"num_steps: the sampler asks for 101 steps, the schedule has 100"),
         ({"batch_size": 0}, r"batch_size: got 0"),
+        ({"max_steps": 0}, r"max_steps: got 0"),
         ({"demonstration_share": 1.5}, r"demonstration_share: got 1.5"),
     ],
 )
