@@ -108,7 +108,7 @@ class Task:
             "collision_terminates", "arrival_terminates",
         )  # fmt: skip
         arguments = {name: getattr(self, name) for name in names}
-        if self.max_steps != Task.max_steps:
+        if self.max_steps != Task.max_steps:  # files from before there was a choice say nothing of it
             arguments["max_steps"] = self.max_steps
         if self.map != "corridor":
             arguments["obstacle_map"] = f"{self.map}:{split}" if self.map in MAP_KINDS else self.map

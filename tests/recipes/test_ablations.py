@@ -59,7 +59,12 @@ def test_a_table_of_ablations_names_its_command(tmp_path, monkeypatch):
 def test_the_paper_as_printed_trains_at_toy_size(tmp_path):
     redig_wedge.train(Config(paper=True, smoke=True, out=tmp_path / "run", threads=1))
     policy, scenario = read_header(tmp_path / "run" / "policy.safetensors")
-    assert (policy.encoder, policy.encoder_activation, policy.noise_ratio) == ("linear", None, 1)
+    assert (policy.encoder, policy.encoder_activation, policy.sampling_steps, policy.noise_ratio) == (
+        "linear",
+        None,
+        100,
+        1,
+    )
     assert (policy.observation_dim, scenario["formation_reward"], scenario["navigation_reward"]) == (
         7,
         "spring_damper",
