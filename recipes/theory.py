@@ -62,6 +62,8 @@ class Arguments:
     """Updates of cloning."""
     updates: int = 200
     """Updates of the critics afterwards, and half as many of the actor."""
+    hidden: int = 128
+    """Width of the hidden layers of denoiser and critics."""
     samples: int = 20_000
     """Samples of the chain with the exact score."""
     num_steps: tuple[int, ...] = (5, 10, 20, 50, 100, 200, 500, 1000)
@@ -72,7 +74,10 @@ class Arguments:
     """Threads of PyTorch; default: its own choice."""
 
 
-SMOKE = {"seeds": (0,), "trajectories": 40, "clone_updates": 20, "updates": 20, "samples": 200, "num_steps": (5, 20)}
+SMOKE = {
+    "seeds": (0,), "trajectories": 40, "clone_updates": 20, "updates": 20, "hidden": 16, "samples": 200,
+    "num_steps": (5, 20),
+}  # fmt: skip
 
 
 def failures(arguments: Arguments) -> dict[str, dict]:
@@ -100,6 +105,7 @@ def main(arguments: Arguments) -> dict[str, Rows]:
         critic_updates=arguments.updates,
         clone_batch=32,
         batch_size=32,
+        hidden=arguments.hidden,
         tau=0.05,  # a short run: targets must follow sooner
     ).resolve()
     known, held_out = demonstration_split(base)

@@ -56,7 +56,9 @@ def test_a_table_of_ablations_names_its_command(tmp_path, monkeypatch):
     assert any(line.startswith("| critics without LayerNorm | 1 |") for line in lines)
 
 
-def test_the_paper_as_printed_trains_at_toy_size(tmp_path):
+def test_the_paper_as_printed_trains_at_toy_size(tmp_path, monkeypatch):
+    for name, value in {"env_steps": 20, "evaluation_starts": 2, "num_starts": 2, "num_envs": 4}.items():
+        monkeypatch.setitem(SMOKE, name, value)  # a hundred steps of the chain for each action take long
     redig_wedge.train(Config(paper=True, smoke=True, out=tmp_path / "run", threads=1))
     policy, scenario = read_header(tmp_path / "run" / "policy.safetensors")
     assert (policy.encoder, policy.encoder_activation, policy.sampling_steps, policy.noise_ratio) == (
