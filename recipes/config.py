@@ -60,7 +60,7 @@ class Config(Task):
     """Trajectories of single robots, planned without coordination unless planner says otherwise."""
     planner: str = "astar"
     """astar, rrt, or virtual_structure: teams that are coordinated by one plan."""
-    demonstration_speed: tuple[float, float] = (0.5, 1.0)
+    demonstration_speed: tuple[float, float] = (0.9, 1.0)
     """Lowest and highest speed of a demonstrating robot, or coordinated team (m/s)."""
     clone_updates: int = 3000
     """Updates of the diffusion loss on demonstrations before online training."""

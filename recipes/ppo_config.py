@@ -36,6 +36,8 @@ class PPOConfig(Task):
     """Updates that clone the demonstrations of the default recipe before PPO; 0: start from nothing."""
     num_trajectories: int = 5000
     """Trajectories of single robots to clone."""
+    demonstration_speed: tuple[float, float] = (0.9, 1.0)
+    """Lowest and highest speed of a demonstrating robot (m/s)."""
     clone_batch: int = 128
     """Teams in a batch of cloning."""
     clone_lr: float = 1e-3

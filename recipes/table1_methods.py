@@ -34,6 +34,9 @@ class Method:
     file: str = "policy.safetensors"
 
 
+# Robots of the demonstrations drive at speeds of their own, which was the default once
+OWN_SPEEDS = ("--demonstration-speed", "0.5", "1")
+
 METHODS: dict[str, Method] = {
     "redig": Method("ReDiG", "redig_wedge.py"),
     "leader_follower": Method("L&F"),
@@ -41,7 +44,7 @@ METHODS: dict[str, Method] = {
     "afor": Method("AFOR (PPO, spring-damper)", "ppo_gnn.py", ("--method", "afor")),
     "afor_redig_reward": Method("AFOR with ReDiG's reward", "ppo_gnn.py", ("--method", "afor_redig_reward")),
     "ppo_cloned": Method(
-        "the same, from a clone of ReDiG's demonstrations",
+        "the same, from a clone of slower demonstrations",
         "ppo_gnn.py",
         (
             "--method",
@@ -54,12 +57,20 @@ METHODS: dict[str, Method] = {
             "0.2",
             "--lr",
             "3e-4",
+            *OWN_SPEEDS,
         ),
     ),
     "redig_coordinated": Method("ReDiG, coordinated demonstrations", "redig_wedge.py", ("--coordinated",)),
     "gaussian": Method("Gaussian actor, trained as ReDiG", "redig_wedge.py", ("--actor", "gaussian")),
-    "deterministic": Method("deterministic actor, trained as ReDiG", "redig_wedge.py", ("--actor", "deterministic")),
+    "redig_slower": Method("ReDiG, slower demonstrations", "redig_wedge.py", OWN_SPEEDS),
+    "gaussian_slower": Method(
+        "Gaussian actor, slower demonstrations", "redig_wedge.py", ("--actor", "gaussian", *OWN_SPEEDS)
+    ),
+    "deterministic_slower": Method(
+        "deterministic actor, slower demonstrations", "redig_wedge.py", ("--actor", "deterministic", *OWN_SPEEDS)
+    ),
     "cloned": Method("ReDiG before online training", of="redig", file="cloned.safetensors"),
+    "cloned_slower": Method("the same, slower demonstrations", of="redig_slower", file="cloned.safetensors"),
     "cloned_coordinated": Method(
         "ReDiG, coordinated, before online training", of="redig_coordinated", file="cloned.safetensors"
     ),
@@ -71,12 +82,14 @@ SPRING = ("--formation-reward", "spring_damper_bonus")
 
 
 def changed(title: str, *options: str) -> Method:
-    """The default recipe with these options."""
-    return Method(title, "redig_wedge.py", options)
+    """The recipe with slower demonstrations and these options."""
+    return Method(title, "redig_wedge.py", (*options, *OWN_SPEEDS))
 
 
-ABLATIONS: dict[str, Method] = {  # rows of recipes/ablations.py: the default recipe with one thing changed
-    **{name: METHODS[name] for name in ("redig", "redig_coordinated", "gaussian", "deterministic")},
+# Rows of recipes/ablations.py: the recipe with slower demonstrations, and one thing changed
+ABLATIONS: dict[str, Method] = {
+    **{name: METHODS[name] for name in ("redig_slower", "redig", "redig_coordinated")},
+    **{name: METHODS[name] for name in ("gaussian_slower", "deterministic_slower")},
     "paper": changed("the paper, as printed", "--paper"),
     "diffusion_spring": changed("diffusion, spring-damper bonus", *SPRING),
     "gaussian_spring": changed("no diffusion, spring-damper bonus", "--actor", "gaussian", *SPRING),

@@ -101,6 +101,7 @@ def main(arguments: Arguments) -> dict[str, Rows]:
         torch.set_num_threads(arguments.threads)
     base = Config(
         num_trajectories=arguments.trajectories,
+        demonstration_speed=(0.5, 1.0),
         clone_updates=arguments.clone_updates,
         critic_updates=arguments.updates,
         clone_batch=32,
@@ -131,7 +132,12 @@ def demonstration_split(config: Config) -> tuple[TensorDictBase, TensorDictBase]
     scenario = config.scenario()
     env = make_env(min(100, config.num_trajectories), reward_scale=config.reward_scale, **scenario)
     episodes = demonstrations(
-        env, config.num_trajectories, config.planner, max_steps=config.max_steps, seed=config.seed
+        env,
+        config.num_trajectories,
+        config.planner,
+        config.demonstration_speed,
+        max_steps=config.max_steps,
+        seed=config.seed,
     )
     keep = [OBSERVATION, ACTION, ("agents", "info", "arrived")]
     windows = MultiStep(config.n_steps, config.gamma, keep=keep)(episodes)

@@ -43,7 +43,7 @@ def demonstrations(
     env: EnvBase,
     num_trajectories: int = 5000,
     planner: str = "astar",
-    speed: tuple[float, float] = (0.5, 1.0),
+    speed: tuple[float, float] = (0.9, 1.0),
     noise: float = 0.05,
     max_steps: int = 200,
     seed: int = 0,
