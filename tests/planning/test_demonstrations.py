@@ -27,7 +27,7 @@ def equal(first, second) -> bool:
 
 @pytest.fixture(scope="module")
 def data():
-    return demonstrations(make_env(steps=200), num_trajectories=13, seed=1)
+    return demonstrations(make_env(steps=200), num_trajectories=13, speed=(0.5, 1.0), seed=1)
 
 
 def test_shapes_and_keys(data):

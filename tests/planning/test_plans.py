@@ -12,7 +12,7 @@ def make_env(num_envs: int, **kwargs):
 
 @pytest.fixture(scope="module")
 def both():
-    settings = {"num_trajectories": 40, "noise": 0.05, "seed": 3}
+    settings = {"num_trajectories": 40, "speed": (0.5, 1.0), "noise": 0.05, "seed": 3}
     return {
         planner: demonstrations(make_env(8), planner=planner, **settings) for planner in ("virtual_structure", "astar")
     }
