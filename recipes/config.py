@@ -6,7 +6,7 @@ import dataclasses
 from dataclasses import dataclass
 from typing import Any
 
-from task import REWARD, Task
+from task import SUITS, Task
 
 PAPER: dict[str, Any] = {  # Table 3 and Sec. 3 as printed, as far as the code still has it; docs/paper.md
     "encoder": "linear", "observe_direction": False, "shared_encoder": True, "formation_reward": "spring_damper",
@@ -60,8 +60,9 @@ class Config(Task):
     """Trajectories of single robots, planned without coordination unless planner says otherwise."""
     planner: str = "astar"
     """astar, rrt, or virtual_structure: teams that are coordinated by one plan."""
-    demonstration_speed: tuple[float, float] = (0.9, 1.0)
-    """Lowest and highest speed of a demonstrating robot, or coordinated team (m/s)."""
+    demonstration_speed: tuple[float, float] | None = None
+    """Lowest and highest speed of a demonstrating robot, or coordinated team (m/s); default: what suits the
+    formation."""
     clone_updates: int = 3000
     """Updates of the diffusion loss on demonstrations before online training."""
     clone_batch: int = 128
@@ -184,7 +185,7 @@ class Config(Task):
         if self.paper and self.coordinated:
             raise ValueError("paper: its robots are not coordinated by one plan, so not with coordinated")
         preset = (PAPER if self.paper else COORDINATED if self.coordinated else {}) | (SMOKE if self.smoke else {})
-        config = dataclasses.replace(self, **preset).filled(REWARD.get(self.formation, REWARD["wedge"]))
+        config = dataclasses.replace(self, **preset).filled(SUITS.get(self.formation, SUITS["wedge"]))
         config.check_positive(
             "num_trajectories", "clone_updates", "clone_batch", "num_envs", "collect_steps", "updates_per_step",
             "batch_size", "buffer_size", "max_steps", "evaluation_interval", "evaluation_starts", "num_starts",

@@ -6,7 +6,7 @@ import dataclasses
 from dataclasses import dataclass
 from typing import Any
 
-from task import REWARD, Task
+from task import SUITS, Task
 
 # What each method is paid for; all else, and what is not given on the command line, is as in the default recipe.
 METHODS: dict[str, dict[str, Any]] = {
@@ -36,8 +36,8 @@ class PPOConfig(Task):
     """Updates that clone the demonstrations of the default recipe before PPO; 0: start from nothing."""
     num_trajectories: int = 5000
     """Trajectories of single robots to clone."""
-    demonstration_speed: tuple[float, float] = (0.9, 1.0)
-    """Lowest and highest speed of a demonstrating robot (m/s)."""
+    demonstration_speed: tuple[float, float] | None = None
+    """Lowest and highest speed of a demonstrating robot (m/s); default: what suits the formation."""
     clone_batch: int = 128
     """Teams in a batch of cloning."""
     clone_lr: float = 1e-3
@@ -100,7 +100,7 @@ class PPOConfig(Task):
         if self.method not in METHODS:
             raise ValueError(f"method: got {self.method!r}, allowed are {', '.join(METHODS)}")
         config = dataclasses.replace(self, **SMOKE) if self.smoke else self
-        config = config.filled(METHODS[config.method]).filled(REWARD.get(config.formation, REWARD["wedge"]))
+        config = config.filled(METHODS[config.method]).filled(SUITS.get(config.formation, SUITS["wedge"]))
         config = config.filled({"formation_reward": Task.formation_reward})
         config.check_positive(
             "num_envs", "horizon", "epochs", "batch_size", "hidden", "num_trajectories", "clone_batch",

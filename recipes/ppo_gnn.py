@@ -11,6 +11,7 @@ import time
 from collections.abc import Callable, Iterator
 from functools import partial
 from pathlib import Path
+from typing import Any
 
 import torch
 import tyro
@@ -175,14 +176,8 @@ def cloning_loss(policy: TensorDictModule, batch: TensorDictBase) -> Tensor:
 def demonstrated(config: PPOConfig, cache: Path) -> TensorDictBase:
     """The demonstrations of the default recipe, as a flat batch of teams."""
     env = make_env(min(250, config.num_trajectories), reward_scale=config.reward_scale, **config.scenario())
-    episodes = demonstrations(
-        env,
-        config.num_trajectories,
-        speed=config.demonstration_speed,
-        max_steps=config.max_steps,
-        seed=config.seed,
-        cache_dir=cache,
-    )
+    plans: dict[str, Any] = {"speed": config.demonstration_speed, "max_steps": config.max_steps, "seed": config.seed}
+    episodes = demonstrations(env, config.num_trajectories, **plans, cache_dir=cache)
     data = episodes[episodes["mask"]]
     data[ACTIVE] = data[ARRIVED] < 0.5
     return data.select(OBSERVATION, ACTION, ACTIVE)

@@ -32,10 +32,13 @@ class Method:
     of: str | None = None
     """The method whose runs leave its policy behind."""
     file: str = "policy.safetensors"
+    formations: tuple[str, ...] = ("circle", "wedge", "line")
+    """Where it differs from the other methods."""
 
 
-# Robots of the demonstrations drive at speeds of their own, which was the default once
+# Robots of the demonstrations drive at speeds of their own: the default of the line, and once of all
 OWN_SPEEDS = ("--demonstration-speed", "0.5", "1")
+NOT_LINE = ("circle", "wedge")
 
 METHODS: dict[str, Method] = {
     "redig": Method("ReDiG", "redig_wedge.py"),
@@ -62,15 +65,24 @@ METHODS: dict[str, Method] = {
     ),
     "redig_coordinated": Method("ReDiG, coordinated demonstrations", "redig_wedge.py", ("--coordinated",)),
     "gaussian": Method("Gaussian actor, trained as ReDiG", "redig_wedge.py", ("--actor", "gaussian")),
-    "redig_slower": Method("ReDiG, slower demonstrations", "redig_wedge.py", OWN_SPEEDS),
+    "deterministic": Method("deterministic actor, trained as ReDiG", "redig_wedge.py", ("--actor", "deterministic")),
+    "redig_slower": Method("ReDiG, slower demonstrations", "redig_wedge.py", OWN_SPEEDS, formations=NOT_LINE),
     "gaussian_slower": Method(
-        "Gaussian actor, slower demonstrations", "redig_wedge.py", ("--actor", "gaussian", *OWN_SPEEDS)
+        "Gaussian actor, slower demonstrations",
+        "redig_wedge.py",
+        ("--actor", "gaussian", *OWN_SPEEDS),
+        formations=NOT_LINE,
     ),
     "deterministic_slower": Method(
-        "deterministic actor, slower demonstrations", "redig_wedge.py", ("--actor", "deterministic", *OWN_SPEEDS)
+        "deterministic actor, slower demonstrations",
+        "redig_wedge.py",
+        ("--actor", "deterministic", *OWN_SPEEDS),
+        formations=NOT_LINE,
     ),
     "cloned": Method("ReDiG before online training", of="redig", file="cloned.safetensors"),
-    "cloned_slower": Method("the same, slower demonstrations", of="redig_slower", file="cloned.safetensors"),
+    "cloned_slower": Method(
+        "the same, slower demonstrations", of="redig_slower", file="cloned.safetensors", formations=NOT_LINE
+    ),
     "cloned_coordinated": Method(
         "ReDiG, coordinated, before online training", of="redig_coordinated", file="cloned.safetensors"
     ),
@@ -208,6 +220,8 @@ def jobs(
     found = []
     for formation in formations:
         for method, what in methods.items():
+            if formation not in what.formations:
+                continue
             for seed in [None] if method in PLANNERS else seeds:
                 suffix = "" if seed is None else f"-seed{seed}"
                 found.append(Job(method, formation, seed, runs / f"{what.of or method}-{formation}{suffix}"))

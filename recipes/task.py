@@ -11,10 +11,11 @@ from typing import Any, Self
 from redig.envs.random_maps import MAP_KINDS
 
 # What suits each formation: too much weight, and a team keeps its shape rather than arrive; the bonus hurries it on.
-REWARD: dict[str, dict[str, Any]] = {
-    "wedge": {"formation_weight": 3.5, "arrival_bonus": 20.0},
-    "line": {"formation_weight": 1.0, "arrival_bonus": 10.0},
-    "circle": {"formation_weight": 2.0, "arrival_bonus": 20.0},
+# Robots that plan alone at one speed collide in a line, as all reach the corridor at once; at their own they do less.
+SUITS: dict[str, dict[str, Any]] = {
+    "wedge": {"formation_weight": 3.5, "arrival_bonus": 20.0, "demonstration_speed": (0.9, 1.0)},
+    "line": {"formation_weight": 1.0, "arrival_bonus": 10.0, "demonstration_speed": (0.5, 1.0)},
+    "circle": {"formation_weight": 2.0, "arrival_bonus": 20.0, "demonstration_speed": (0.9, 1.0)},
 }
 
 

@@ -14,7 +14,7 @@ from config import Config
 from conftest import command
 from PIL import Image
 from ppo_config import SMOKE, PPOConfig
-from task import REWARD
+from task import SUITS
 from tensordict import TensorDict
 from torchrl.collectors import Collector
 from torchrl.envs.utils import ExplorationType, set_exploration_type
@@ -107,7 +107,7 @@ def test_methods_differ_in_the_reward_alone():
     assert rewards["afor"]["formation_reward"].startswith("spring_damper")
     given = PPOConfig(method="afor", formation_reward="none", formation_weight=9.0, formation="line").resolve()
     assert (given.formation_reward, given.formation_weight) == ("none", 9.0)
-    assert given.arrival_bonus == REWARD["line"]["arrival_bonus"]
+    assert given.arrival_bonus == SUITS["line"]["arrival_bonus"]
 
 
 def test_frames_are_those_of_the_default_recipe():
