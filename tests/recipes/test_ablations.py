@@ -74,3 +74,10 @@ def test_the_paper_as_printed_trains_at_toy_size(tmp_path, monkeypatch):
     )
     saved = json.loads((tmp_path / "run" / "config.json").read_text())
     assert all(saved[name] == value for name, value in PAPER.items() if name not in SMOKE)
+
+
+def test_each_formation_has_the_demonstrations_that_suit_it():
+    speeds = {name: Config(formation=name).resolve().demonstration_speed for name in ("wedge", "circle", "line")}
+    assert speeds == {"wedge": (0.9, 1.0), "circle": (0.9, 1.0), "line": (0.5, 1.0)}
+    assert Config(formation="line", demonstration_speed=(0.8, 0.9)).resolve().demonstration_speed == (0.8, 0.9)
+    assert Config(coordinated=True).resolve().demonstration_speed == (1.0, 1.0)
