@@ -77,8 +77,7 @@ def test_a_table_of_all_methods_has_them_in_order_with_the_papers_numbers(table,
         there = [method for method in METHODS.values() if formation in method.formations]
         start = table.index(f"### {formation.capitalize()}") + 4
         rows = [
-            [cell.strip() for cell in line.split("|")[1:-1]]
-            for line in table[start : start + len(there) + len(PAPER)]
+            [cell.strip() for cell in line.split("|")[1:-1]] for line in table[start : start + len(there) + len(PAPER)]
         ]
         titles = [row[0] for row in rows if "paper" not in row[0]]
         assert titles == [method.title for method in there]
