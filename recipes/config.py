@@ -56,13 +56,8 @@ class Config(Task):
     episode; None: they move in any direction at once."""
 
     # demonstrations and cloning
-    num_trajectories: int = 5000
-    """Trajectories of single robots, planned without coordination unless planner says otherwise."""
     planner: str = "astar"
-    """astar, rrt, or virtual_structure: teams that are coordinated by one plan."""
-    demonstration_speed: tuple[float, float] | None = None
-    """Lowest and highest speed of a demonstrating robot, or coordinated team (m/s); default: what suits the
-    formation."""
+    """astar or rrt: each robot plans alone; virtual_structure: teams that are coordinated by one plan."""
     clone_updates: int = 3000
     """Updates of the diffusion loss on demonstrations before online training."""
     clone_batch: int = 128

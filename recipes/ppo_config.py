@@ -34,10 +34,6 @@ class PPOConfig(Task):
     # a warm start
     clone_updates: int = 0
     """Updates that clone the demonstrations of the default recipe before PPO; 0: start from nothing."""
-    num_trajectories: int = 5000
-    """Trajectories of single robots to clone."""
-    demonstration_speed: tuple[float, float] | None = None
-    """Lowest and highest speed of a demonstrating robot (m/s); default: what suits the formation."""
     clone_batch: int = 128
     """Teams in a batch of cloning."""
     clone_lr: float = 1e-3

@@ -11,7 +11,6 @@ import time
 from collections.abc import Callable, Iterator
 from functools import partial
 from pathlib import Path
-from typing import Any
 
 import torch
 import tyro
@@ -176,8 +175,7 @@ def cloning_loss(policy: TensorDictModule, batch: TensorDictBase) -> Tensor:
 def demonstrated(config: PPOConfig, cache: Path) -> TensorDictBase:
     """The demonstrations of the default recipe, as a flat batch of teams."""
     env = make_env(min(250, config.num_trajectories), reward_scale=config.reward_scale, **config.scenario())
-    plans: dict[str, Any] = {"speed": config.demonstration_speed, "max_steps": config.max_steps, "seed": config.seed}
-    episodes = demonstrations(env, config.num_trajectories, **plans, cache_dir=cache)
+    episodes = demonstrations(env, **config.plans(), cache_dir=cache)
     data = episodes[episodes["mask"]]
     data[ACTIVE] = data[ARRIVED] < 0.5
     return data.select(OBSERVATION, ACTION, ACTIVE)

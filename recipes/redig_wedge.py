@@ -10,7 +10,6 @@ from __future__ import annotations
 import time
 from functools import partial
 from pathlib import Path
-from typing import Any
 
 import torch
 import tyro
@@ -69,9 +68,7 @@ def train(config: Config) -> dict[str, float]:
     same_robots = {**scenario, "turn_gain": config.turn_gain}  # but no delay, noise or weak motors
     demo_env = make_env(min(250, config.num_trajectories), reward_scale=config.reward_scale, **same_robots)
     cache = folder.parent / "demonstrations"
-    plans: dict[str, Any] = {"planner": config.planner, "speed": config.demonstration_speed, "seed": config.seed}
-    plans |= {"num_trajectories": config.num_trajectories, "max_steps": config.max_steps}
-    episodes = demonstrations(demo_env, **plans, cache_dir=cache)
+    episodes = demonstrations(demo_env, planner=config.planner, **config.plans(), cache_dir=cache)
     demos = transitions(multi_step(episodes)[episodes["mask"]], demonstration=True)
     on_disk = config.buffer_on_disk
     storage = DiskStorage(config.buffer_size, folder / "buffer") if on_disk else LazyTensorStorage(config.buffer_size)

@@ -15,6 +15,7 @@ from config import Config
 from tensordict.nn import TensorDictModuleBase
 from torchrl.envs import EnvBase
 
+from redig.envs.formations import FORMATIONS
 from redig.files import replacing
 from redig.policy import load_policy, read_header
 
@@ -32,7 +33,7 @@ class Method:
     of: str | None = None
     """The method whose runs leave its policy behind."""
     file: str = "policy.safetensors"
-    formations: tuple[str, ...] = ("circle", "wedge", "line")
+    formations: tuple[str, ...] = FORMATIONS
     """Where it differs from the other methods."""
 
 

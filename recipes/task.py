@@ -84,6 +84,13 @@ class Task:
     reward_scale: float = 0.1
     """Scale of the reward (paper: 0.01)."""
 
+    # demonstrations
+    num_trajectories: int = 5000
+    """Trajectories of single robots."""
+    demonstration_speed: tuple[float, float] | None = None
+    """Lowest and highest speed of a demonstrating robot, or coordinated team (m/s); default: what suits the
+    formation."""
+
     # what robots hear of each other
     encoder: str = "edgeconv"
     """edgeconv; linear as printed in the paper; or relu, the same with a ReLU behind W^z."""
@@ -114,6 +121,15 @@ class Task:
         if self.map != "corridor":
             arguments["obstacle_map"] = f"{self.map}:{split}" if self.map in MAP_KINDS else self.map
         return arguments
+
+    def plans(self) -> dict[str, Any]:
+        """Arguments of :func:`redig.planning.demonstrations` that make the demonstrations, beside the planner."""
+        return {
+            "num_trajectories": self.num_trajectories,
+            "speed": self.demonstration_speed,
+            "max_steps": self.max_steps,
+            "seed": self.seed,
+        }
 
     def ends_of_policy(self, observation_dim: int) -> dict[str, Any]:
         """What every policy of the task has: the encoder that its observations go into, and the bounds of commands."""

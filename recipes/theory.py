@@ -10,7 +10,6 @@ import dataclasses
 import math
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import torch
 import tyro
@@ -132,8 +131,7 @@ def demonstration_split(config: Config) -> tuple[TensorDictBase, TensorDictBase]
     """N-step transitions of four fifths of the demonstrated episodes, and of the rest."""
     scenario = config.scenario()
     env = make_env(min(100, config.num_trajectories), reward_scale=config.reward_scale, **scenario)
-    plans: dict[str, Any] = {"planner": config.planner, "speed": config.demonstration_speed, "seed": config.seed}
-    episodes = demonstrations(env, config.num_trajectories, **plans, max_steps=config.max_steps)
+    episodes = demonstrations(env, planner=config.planner, **config.plans())
     keep = [OBSERVATION, ACTION, ("agents", "info", "arrived")]
     windows = MultiStep(config.n_steps, config.gamma, keep=keep)(episodes)
     split = len(episodes) * 4 // 5
