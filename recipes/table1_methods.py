@@ -41,29 +41,19 @@ class Method:
 OWN_SPEEDS = ("--demonstration-speed", "0.5", "1")
 NOT_LINE = ("circle", "wedge")
 
+# What suits PPO that starts from a clone (docs/results/ppo)
+PPO_CLONED = (
+    *("--method", "afor_redig_reward", "--clone-updates", "2000"),
+    *("--value-rounds", "8", "--initial-std", "0.2", "--lr", "3e-4"),
+)
+
 METHODS: dict[str, Method] = {
     "redig": Method("ReDiG", "redig_wedge.py"),
     "leader_follower": Method("L&F"),
     "dgnn": Method("DGNN (PPO)", "ppo_gnn.py", ("--method", "dgnn")),
     "afor": Method("AFOR (PPO, spring-damper)", "ppo_gnn.py", ("--method", "afor")),
     "afor_redig_reward": Method("AFOR with ReDiG's reward", "ppo_gnn.py", ("--method", "afor_redig_reward")),
-    "ppo_cloned": Method(
-        "the same, from a clone of slower demonstrations",
-        "ppo_gnn.py",
-        (
-            "--method",
-            "afor_redig_reward",
-            "--clone-updates",
-            "2000",
-            "--value-rounds",
-            "8",
-            "--initial-std",
-            "0.2",
-            "--lr",
-            "3e-4",
-            *OWN_SPEEDS,
-        ),
-    ),
+    "ppo_cloned": Method("the same, from a clone", "ppo_gnn.py", PPO_CLONED),
     "redig_coordinated": Method("ReDiG, coordinated demonstrations", "redig_wedge.py", ("--coordinated",)),
     "gaussian": Method("Gaussian actor, trained as ReDiG", "redig_wedge.py", ("--actor", "gaussian")),
     "deterministic": Method("deterministic actor, trained as ReDiG", "redig_wedge.py", ("--actor", "deterministic")),
@@ -78,6 +68,12 @@ METHODS: dict[str, Method] = {
         "deterministic actor, slower demonstrations",
         "redig_wedge.py",
         ("--actor", "deterministic", *OWN_SPEEDS),
+        formations=NOT_LINE,
+    ),
+    "ppo_cloned_slower": Method(
+        "AFOR with ReDiG's reward, from a clone of slower demonstrations",
+        "ppo_gnn.py",
+        (*PPO_CLONED, *OWN_SPEEDS),
         formations=NOT_LINE,
     ),
     "cloned": Method("ReDiG before online training", of="redig", file="cloned.safetensors"),
