@@ -1,4 +1,4 @@
-"""Ablations: the recipe with slower demonstrations, one thing changed at a time, in a table like Table 1.
+"""Ablations: the recipe with its earlier defaults, one thing changed at a time, in a table like Table 1.
 
 Run ``python recipes/ablations.py``; ``--only encoder_linear:wedge`` does a part, ``--help`` explains each option.
 """
@@ -16,7 +16,7 @@ from table1_methods import ABLATIONS
 
 @dataclass
 class Arguments(table1.Arguments):
-    """Train (or load), evaluate and compare the recipe with slower demonstrations, one thing changed at a time."""
+    """Train (or load), evaluate and compare the recipe with its earlier defaults, one thing changed at a time."""
 
     formations: tuple[str, ...] = ("wedge",)
     """Formations."""

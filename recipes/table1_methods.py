@@ -37,9 +37,11 @@ class Method:
     """Where it differs from the other methods."""
 
 
-# Robots of the demonstrations drive at speeds of their own: the default of the line, and once of all
-OWN_SPEEDS = ("--demonstration-speed", "0.5", "1")
-NOT_LINE = ("circle", "wedge")
+# Earlier defaults: the observed direction to obstacles jumps on midlines; and robots of the demonstrations drive at
+# speeds of their own (of the line that is still the default)
+JUMPS = ("--direction-smoothing", "0")
+SLOWER = ("--demonstration-speed", "0.5", "1", *JUMPS)
+LINE, NOT_LINE = ("line",), ("circle", "wedge")
 
 # What suits PPO that starts from a clone (docs/results/ppo)
 PPO_CLONED = (
@@ -47,39 +49,45 @@ PPO_CLONED = (
     *("--value-rounds", "8", "--initial-std", "0.2", "--lr", "3e-4"),
 )
 
+GAUSSIAN, DETERMINISTIC = ("--actor", "gaussian"), ("--actor", "deterministic")
+
 METHODS: dict[str, Method] = {
     "redig": Method("ReDiG", "redig_wedge.py"),
     "leader_follower": Method("L&F"),
-    "dgnn": Method("DGNN (PPO)", "ppo_gnn.py", ("--method", "dgnn")),
-    "afor": Method("AFOR (PPO, spring-damper)", "ppo_gnn.py", ("--method", "afor")),
-    "afor_redig_reward": Method("AFOR with ReDiG's reward", "ppo_gnn.py", ("--method", "afor_redig_reward")),
+    "dgnn": Method("DGNN (PPO)", "ppo_gnn.py", ("--method", "dgnn", *JUMPS)),
+    "afor": Method("AFOR (PPO, spring-damper)", "ppo_gnn.py", ("--method", "afor", *JUMPS)),
+    "afor_redig_reward": Method("AFOR with ReDiG's reward", "ppo_gnn.py", ("--method", "afor_redig_reward", *JUMPS)),
     "ppo_cloned": Method("the same, from a clone", "ppo_gnn.py", PPO_CLONED),
-    "redig_coordinated": Method("ReDiG, coordinated demonstrations", "redig_wedge.py", ("--coordinated",)),
-    "gaussian": Method("Gaussian actor, trained as ReDiG", "redig_wedge.py", ("--actor", "gaussian")),
-    "deterministic": Method("deterministic actor, trained as ReDiG", "redig_wedge.py", ("--actor", "deterministic")),
-    "redig_slower": Method("ReDiG, slower demonstrations", "redig_wedge.py", OWN_SPEEDS, formations=NOT_LINE),
+    "redig_coordinated": Method("ReDiG, coordinated demonstrations", "redig_wedge.py", ("--coordinated", *JUMPS)),
+    "gaussian": Method("Gaussian actor, trained as ReDiG", "redig_wedge.py", GAUSSIAN),
+    "deterministic": Method("deterministic actor, trained as ReDiG", "redig_wedge.py", DETERMINISTIC),
+    "redig_jumps": Method("ReDiG, direction that jumps", "redig_wedge.py", JUMPS),
+    "gaussian_jumps": Method(
+        "Gaussian actor, direction that jumps", "redig_wedge.py", (*GAUSSIAN, *JUMPS), formations=LINE
+    ),
+    "deterministic_jumps": Method(
+        "deterministic actor, direction that jumps", "redig_wedge.py", (*DETERMINISTIC, *JUMPS), formations=LINE
+    ),
+    "ppo_cloned_jumps": Method(
+        "PPO from a clone, direction that jumps", "ppo_gnn.py", (*PPO_CLONED, *JUMPS), formations=LINE
+    ),
+    "redig_slower": Method("ReDiG, that and slower demonstrations", "redig_wedge.py", SLOWER, formations=NOT_LINE),
     "gaussian_slower": Method(
-        "Gaussian actor, slower demonstrations",
-        "redig_wedge.py",
-        ("--actor", "gaussian", *OWN_SPEEDS),
-        formations=NOT_LINE,
+        "Gaussian actor, that and slower demonstrations", "redig_wedge.py", (*GAUSSIAN, *SLOWER), formations=NOT_LINE
     ),
     "deterministic_slower": Method(
-        "deterministic actor, slower demonstrations",
+        "deterministic actor, that and slower demonstrations",
         "redig_wedge.py",
-        ("--actor", "deterministic", *OWN_SPEEDS),
+        (*DETERMINISTIC, *SLOWER),
         formations=NOT_LINE,
     ),
     "ppo_cloned_slower": Method(
-        "AFOR with ReDiG's reward, from a clone of slower demonstrations",
+        "PPO from a clone, that and slower demonstrations",
         "ppo_gnn.py",
-        (*PPO_CLONED, *OWN_SPEEDS),
+        (*PPO_CLONED, *SLOWER),
         formations=NOT_LINE,
     ),
     "cloned": Method("ReDiG before online training", of="redig", file="cloned.safetensors"),
-    "cloned_slower": Method(
-        "the same, slower demonstrations", of="redig_slower", file="cloned.safetensors", formations=NOT_LINE
-    ),
     "cloned_coordinated": Method(
         "ReDiG, coordinated, before online training", of="redig_coordinated", file="cloned.safetensors"
     ),
@@ -91,18 +99,18 @@ SPRING = ("--formation-reward", "spring_damper_bonus")
 
 
 def changed(title: str, *options: str) -> Method:
-    """The recipe with slower demonstrations and these options."""
-    return Method(title, "redig_wedge.py", (*options, *OWN_SPEEDS))
+    """The recipe with its earlier defaults and these options."""
+    return Method(title, "redig_wedge.py", (*options, *SLOWER))
 
 
-# Rows of recipes/ablations.py: the recipe with slower demonstrations, and one thing changed
+# Rows of recipes/ablations.py: the recipe with its earlier defaults, and one thing changed
 ABLATIONS: dict[str, Method] = {
-    **{name: METHODS[name] for name in ("redig_slower", "redig", "redig_coordinated")},
+    **{name: METHODS[name] for name in ("redig_slower", "redig", "redig_jumps", "redig_coordinated")},
     **{name: METHODS[name] for name in ("gaussian_slower", "deterministic_slower")},
     "paper": changed("the paper, as printed", "--paper"),
     "diffusion_spring": changed("diffusion, spring-damper bonus", *SPRING),
-    "gaussian_spring": changed("no diffusion, spring-damper bonus", "--actor", "gaussian", *SPRING),
-    "gaussian_none": changed("no diffusion, no formation reward", "--actor", "gaussian", "--formation-reward", "none"),
+    "gaussian_spring": changed("no diffusion, spring-damper bonus", *GAUSSIAN, *SPRING),
+    "gaussian_none": changed("no diffusion, no formation reward", *GAUSSIAN, "--formation-reward", "none"),
     "diffusion_none": changed("diffusion, no formation reward", "--formation-reward", "none"),
     "encoder_linear": changed("linear encoder, as printed", "--encoder", "linear"),
     "encoder_relu": changed("linear encoder with ReLU", "--encoder", "relu"),

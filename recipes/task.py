@@ -57,7 +57,10 @@ class Task:
     max_steps: int = 200
     """Steps of 0.1 s until a team's episode is cut; a longer map may need more."""
     observe_direction: bool = True
-    """Observe the unit vector to the nearest obstacle; without it the state is the paper's seven numbers."""
+    """Observe the direction to the nearest obstacle; without it the state is the paper's seven numbers."""
+    direction_smoothing: float = 0.1
+    """How far to either side of where the nearest obstacle changes that direction turns (m); 0: it jumps there, and
+    robots tremble on the midline of a corridor."""
 
     # the reward
     formation_reward: str = "scaled"
@@ -111,8 +114,8 @@ class Task:
         """Arguments of :func:`redig.envs.make_env` that make the task; random maps are those of a split."""
         names = (
             "formation", "n_robots", "formation_width", "corridor_width", "corridor_length", "max_speed",
-            "max_acceleration", "observe_direction", "formation_reward", "formation_weight", "omega",
-            "navigation_reward", "time_cost", "arrival_bonus", "collision_penalty", "proximity_penalty",
+            "max_acceleration", "observe_direction", "direction_smoothing", "formation_reward", "formation_weight",
+            "omega", "navigation_reward", "time_cost", "arrival_bonus", "collision_penalty", "proximity_penalty",
             "collision_terminates", "arrival_terminates",
         )  # fmt: skip
         arguments = {name: getattr(self, name) for name in names}

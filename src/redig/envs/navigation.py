@@ -8,6 +8,7 @@ from vmas.simulator.core import Agent, Sphere, World
 from vmas.simulator.scenario import BaseScenario
 
 from redig.envs import rewards, starts
+from redig.envs.direction import smoothed_direction
 from redig.envs.dynamics import leave_walls, part_robots
 from redig.envs.formation_reward import FORMATION_REWARDS, formation_reward
 from redig.envs.formations import formation_offsets, pairwise_distances
@@ -42,6 +43,8 @@ class FormationNavigation(BaseScenario):
       slowest and fastest turn towards commands (1/s), drawn likewise, of robots with wheels that start facing their
       goals, see :class:`~redig.envs.TurningCommand`; ``None``: points that move in any direction at once.
     * ``observe_direction``: add the unit vector to the nearest obstacle (9 numbers); ``False`` gives the paper's 7.
+      ``direction_smoothing`` (m): how far to either side of where the nearest obstacle changes that vector turns, see
+      :func:`~redig.envs.direction.smoothed_direction`; 0: it jumps.
     * ``formation_reward``: one of ``spring_damper`` (Eq. 29), ``spring_damper_bonus``, ``scaled``, ``slanted``,
       ``integrity``, ``none``; ``formation_weight``; ``omega``. The frame of ``scaled`` and ``slanted`` is the goal's
       heading, so that the goal itself is a perfect formation. On a route it is turned back by as much as the route
@@ -55,7 +58,7 @@ class FormationNavigation(BaseScenario):
     * ``hold_steps``: steps for which the team holds at its goals before the episode ends.
 
     Observation of a robot: position (m), velocity (m/s), goal - position (m), distance to the nearest obstacle (m) and,
-    optionally, the unit vector to it. A robot that has arrived holds: it is steered to its goal whatever its command.
+    optionally, the direction to it. A robot that has arrived holds: it is steered to its goal whatever its command.
 
     ``info`` of a robot: ``position``, ``velocity``, ``pairwise_distance`` ``[n]``, ``navigation_reward``,
     ``formation_reward``, ``arrival_reward``, ``collision_reward``, ``wall_collision``, ``robot_collision``,
@@ -123,6 +126,7 @@ class FormationNavigation(BaseScenario):
         self.max_speed, self.max_acceleration = take("max_speed", 1.0), take("max_acceleration", 2.0)
         self.acceleration_range, self.turn_gain = take("acceleration_range", None), take("turn_gain", None)
         self.observe_direction = take("observe_direction", True)
+        self.direction_smoothing = take("direction_smoothing", 0.0)
         self.formation_reward = take("formation_reward", "spring_damper")
         self.formation_weight, self.omega = take("formation_weight", 1.0), take("omega", 0.5)
         self.navigation_reward = take("navigation_reward", "goal_speed")
@@ -145,6 +149,8 @@ class FormationNavigation(BaseScenario):
         for name in positive:
             if not getattr(self, name) > 0:
                 raise ValueError(f"{name}: got {getattr(self, name)}, must be greater than 0")
+        if not self.direction_smoothing >= 0:
+            raise ValueError(f"direction_smoothing: got {self.direction_smoothing}, must be at least 0 m")
         if self.max_speed * self.dt > self.radius:
             raise ValueError(
                 f"max_speed: got {self.max_speed} m/s, at which a robot covers more than its radius ({self.radius} m) "
@@ -274,6 +280,8 @@ class FormationNavigation(BaseScenario):
         zero = position.new_zeros(position.shape[:2])
         distance, direction = self.obstacle_map.nearest(position)
         observation = [position, velocity, self.goal - position, distance.unsqueeze(-1)]
+        if self.direction_smoothing:
+            direction = smoothed_direction(self.obstacle_map, position, self.direction_smoothing)
         if self.observe_direction:
             observation.append(direction)
         names = ("navigation_reward", "formation_reward", "arrival_reward", "collision_reward")

@@ -1,0 +1,40 @@
+"""The direction to the nearest obstacle as robots observe it: one that does not jump half way between two."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+from redig.envs.map_batch import AnyMap
+
+
+def smoothed_direction(obstacle_map: AnyMap, point: Tensor, reach: float) -> Tensor:
+    """Minus the slope of the signed distance d by central differences, ``(d(p - h e_k) - d(p + h e_k)) / 2h``.
+
+    The unit vector to the nearest obstacle turns around at once where another one becomes the nearest, as on the
+    midline of a corridor, and a policy that sees it do so trembles there. This one is that unit vector where the same
+    straight wall is the nearest within ``reach``, and passes through zero, in proportion, across a midline.
+
+    Args:
+        obstacle_map: with a signed distance.
+        point: ``[*B, 2]`` (m).
+        reach: h, how far to either side the differences reach (m).
+
+    Returns:
+        ``[*B, 2]``, of a length of at most 1: where differences around a corner make it longer, it is cut.
+
+    Raises:
+        ValueError: if ``reach`` is not positive.
+
+    Examples:
+        >>> from redig.envs.maps import corridor
+        >>> across = torch.tensor([[0.0, 0.0], [0.0, 0.025], [0.0, 0.25]])
+        >>> smoothed_direction(corridor(1.1), across, reach=0.1)[:, 1].round(decimals=3)  # walls at -0.55 and 0.55 m
+        tensor([0.0000, 0.2500, 1.0000])
+    """
+    if not reach > 0:
+        raise ValueError(f"reach: got {reach}, must be greater than 0 m")
+    steps = reach * torch.eye(2, dtype=point.dtype, device=point.device)
+    distance = obstacle_map.signed_distance
+    slope = torch.stack([distance(point - step) - distance(point + step) for step in steps], -1) / (2 * reach)
+    return slope / slope.norm(dim=-1, keepdim=True).clamp_min(1)
