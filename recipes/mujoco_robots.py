@@ -122,7 +122,8 @@ def main(arguments: Arguments) -> dict[str, float]:
     network = DDSWorld(robots, domain_id=arguments.domain_id)
     obstacle_map = boxes(map_at(scenario.obstacle_map, 0))
     world = PhysicsWorld(obstacle_map, scenario.n_robots)
-    team = LiveTeam(world, obstacle_map, robots, network)
+    smoothing = scenario.direction_smoothing
+    team = LiveTeam(world, obstacle_map, robots, network, direction_smoothing=smoothing)
     runs = []
     with ExitStack() as stack:
         if arguments.spawn:

@@ -95,7 +95,7 @@ def test_one_that_dies_and_returns_with_its_clock_reset(hearing, caplog):
         ({"velocity": (math.inf, 0.0)}, "velocity of robot_1"),
         ({"position": (1e300, 0.0)}, "position of robot_1"),
         ({"goal": (0.0, -1e7)}, "goal of robot_1"),
-        ({"obstacle_direction": (3.0, 4.0)}, "must have length 1"),
+        ({"obstacle_direction": (3.0, 4.0)}, "must have a length of at most 1"),
         ({"velocity": (2.0, 0.5)}, "faster than 2 m/s"),
         ({"position": (1.0, 0.0)}, "leapt 1 m"),
         ({"robot": "robot_9"}, "not one of the team"),

@@ -8,7 +8,8 @@ from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
 from redig.deploy.proximity import LaserScan, OccupancyGrid, to_robot, to_world
-from redig.envs.maps import ObstacleMap
+from redig.envs.direction import smoothed_direction
+from redig.envs.maps import ObstacleMap, corridor
 
 grids = arrays(bool, st.tuples(st.integers(1, 6), st.integers(1, 6))).filter(lambda cells: not cells.all())
 angles = st.floats(-math.pi, math.pi)
@@ -85,6 +86,31 @@ def test_a_map_of_boxes_drawn_into_cells_gives_the_same_as_the_map():
                 np.testing.assert_allclose(found.direction, direction.numpy(), atol=1e-9)
         checked += 1
     assert checked > 100
+
+
+def test_the_smoothed_direction_is_that_of_training():
+    y, x = torch.meshgrid(-2.975 + 0.05 * torch.arange(120), -2.975 + 0.05 * torch.arange(120), indexing="ij")
+    walls = corridor(1.1, 2.0)
+    grid = OccupancyGrid((walls.signed_distance(torch.stack([x, y], -1)) < 0).numpy(), 0.05, (-3.0, -3.0, 0.0))
+    for place in ((0.0, 0.0), (0.3, 0.03), (-0.2, -0.07), (0.4, 0.3)):
+        found = grid.nearest(place, smoothing=0.1)
+        assert found.distance == grid.nearest(place).distance
+        expected = smoothed_direction(walls, torch.tensor(place), 0.1)
+        np.testing.assert_allclose(found.direction, expected.numpy(), atol=1e-6)
+    heading = 0.5
+    turned = grid.nearest_from((0.3, 0.03), heading, smoothing=0.1)
+    np.testing.assert_allclose(to_world(turned.direction, heading), grid.nearest((0.3, 0.03), 0.1).direction)
+
+
+def test_a_scan_between_two_walls_gives_the_smoothed_direction():
+    beams = np.radians(np.arange(-180.0, 180.0, 0.25))
+    for y in (-0.2, -0.05, 0.0, 0.02):  # of the robot, walls at -0.5 and 0.5 m
+        with np.errstate(divide="ignore"):
+            ranges = np.where(beams > 0, 0.5 - y, 0.5 + y) / np.abs(np.sin(beams))
+        scan = LaserScan(-math.pi, math.radians(0.25), 0.05, 5.0, ranges)
+        distance, direction = scan.nearest(smoothing=0.1)
+        assert distance == pytest.approx(0.5 - abs(y), abs=1e-3)
+        np.testing.assert_allclose(direction, (0.0, np.clip(y / 0.1, -1, 1)), atol=2e-3)
 
 
 def test_grids_that_are_none():

@@ -56,6 +56,16 @@ def test_robots_hear_what_the_world_is(live):
     assert state.obstacle_distance == pytest.approx(np.linalg.norm(corner), rel=1e-3)
 
 
+def test_robots_hear_a_smoothed_direction_if_their_policy_was_trained_with_one():
+    walls, network = corridor(), Fake()
+    team = LiveTeam(PhysicsWorld(walls, 1), walls, NAMES[:1], network, direction_smoothing=0.1)
+    team.reset([[0.0, 0.05]], [0.0], [[3.0, 0.0]], now=10.0)  # of the two walls, the left one is nearer
+    state, _ = network.told["robot_0"]
+    state.check()
+    assert state.obstacle_distance == pytest.approx(0.5, abs=1e-3)
+    assert state.obstacle_direction == pytest.approx((0.0, 0.5), abs=1e-3)
+
+
 def test_each_robot_carries_out_its_own_command(live):
     team, network = live
     run(team, network, (0.5, 0.0, 0.0), 50, name="robot_1")

@@ -33,6 +33,7 @@ from redig.deploy.ros_state import (
     StateParts,
     StateTransport,
     check_namespace,
+    obstacle_vector,
     to_quaternion,
     topic_names,
 )
@@ -213,10 +214,10 @@ class _StateWriter:
         """Publish a state, all of it in one frame."""
         state, heading = sensed
         header = Header(Time.of(state.stamp), frame)
-        distance, (x, y) = state.obstacle_distance, state.obstacle_direction
+        wall = Vector3(*obstacle_vector(state.obstacle_distance, state.obstacle_direction))
         self._write["twist"](TwistStamped(header, Twist(Vector3(*state.velocity))))
         self._write["goal"](PoseStamped(header, Pose(Point(*state.goal))))
-        self._write["obstacle"](Vector3Stamped(header, Vector3(distance * x, distance * y)))
+        self._write["obstacle"](Vector3Stamped(header, wall))
         self._write["pose"](PoseStamped(header, Pose(Point(*state.position), Quaternion(*to_quaternion(heading)))))
 
 

@@ -26,7 +26,8 @@ class RobotState:
         velocity: (m/s).
         goal: where it is to go (m), not relative to its position.
         obstacle_distance: to the nearest obstacle (m), from the robot's centre; negative inside one.
-        obstacle_direction: unit vector to that obstacle; zeros where it is not known.
+        obstacle_direction: unit vector to that obstacle; shorter near where another one becomes the nearest, if the
+            policy was trained with ``direction_smoothing``; zeros where it is not known.
 
     Examples:
         >>> state = RobotState("robot_0", 12.5, (0.0, 1.0), (0.3, 0.0), (5.5, 1.0), 0.8, (0.0, -1.0))
@@ -80,9 +81,9 @@ class RobotState:
                 allowed = "a finite number" if limit == math.inf else f"a finite number of at most {limit:g}"
                 raise ValueError(f"{name} of {self.robot}: got {value!r}, must be {allowed}")
         length = math.hypot(*self.obstacle_direction)
-        if length > 0 and abs(length - 1) > 1e-3:
+        if length > 1 + 1e-3:
             got = f"got {self.obstacle_direction!r} of length {length:.4g}"
-            raise ValueError(f"obstacle_direction of {self.robot}: {got}, must have length 1, or 0 if not known")
+            raise ValueError(f"obstacle_direction of {self.robot}: {got}, must have a length of at most 1")
 
 
 def _is_pair(value: Any) -> bool:

@@ -1,14 +1,15 @@
 """How far the nearest obstacle is and where, from what a robot has: a map of cells, or a planar laser scan.
 
 Policies were trained on :meth:`ObstacleMap.nearest <redig.envs.ObstacleMap.nearest>`: the distance from the robot's
-centre, and the unit vector towards the obstacle in the world frame. Sensors know the robot's frame;
-:func:`to_world` and :func:`to_robot` turn vectors between the two.
+centre, and the unit vector towards the obstacle in the world frame; or, with ``direction_smoothing``, on
+:func:`~redig.envs.direction.smoothed_direction`. Sensors know the robot's frame; :func:`to_world` and :func:`to_robot`
+turn vectors between the two.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from typing import NamedTuple
@@ -20,7 +21,7 @@ from redig.deploy.messages import Vector
 
 
 class Proximity(NamedTuple):
-    """The nearest obstacle: distance (m), negative inside one, and the unit vector towards it, or zeros.
+    """The nearest obstacle: distance (m), negative inside one, and the unit vector towards it, or a shorter one.
 
     Examples:
         >>> ahead = Proximity(0.5, (1.0, 0.0))
@@ -53,6 +54,15 @@ def to_robot(vector: Vector, heading: float) -> Vector:
         (1.0, 0.0)
     """
     return to_world(vector, -heading)
+
+
+def _smoothed(distance: Callable[[Vector], float], place: Vector, reach: float) -> Vector:
+    """:func:`~redig.envs.direction.smoothed_direction` at one place, for a distance that is a plain number."""
+    x, y = place
+    slope_x = (distance((x - reach, y)) - distance((x + reach, y))) / (2 * reach)
+    slope_y = (distance((x, y - reach)) - distance((x, y + reach))) / (2 * reach)
+    length = max(1.0, math.hypot(slope_x, slope_y))
+    return slope_x / length, slope_y / length
 
 
 @dataclass(frozen=True, eq=False)
@@ -93,12 +103,15 @@ class OccupancyGrid:
         if len(self.origin) != 3 or not all(map(math.isfinite, self.origin)):
             raise ValueError(f"origin: got {self.origin}, must be x, y (m) and heading (rad)")
 
-    def nearest(self, position: Vector) -> Proximity:
+    def nearest(self, position: Vector, smoothing: float = 0.0) -> Proximity:
         """From a place (m), exact to the closest point of the cell, direction in the world frame.
 
         In an occupied cell, the distance is minus that to the nearest free one, and the direction points away from
-        there, as in training.
+        there, as in training. ``smoothing`` (m) is the ``direction_smoothing`` that the policy was trained with.
         """
+        if smoothing > 0:
+            direction = _smoothed(lambda place: self.nearest(place).distance, position, smoothing)
+            return Proximity(self.nearest(position).distance, direction)
         x, y = to_robot((position[0] - self.origin[0], position[1] - self.origin[1]), self.origin[2])
         place = np.array([x, y]) / self.resolution
         inside = self._is_occupied(place)
@@ -112,9 +125,9 @@ class OccupancyGrid:
         distance = sign * math.sqrt(squared[closest]) * self.resolution
         return Proximity(distance, to_world((float(unit[0]), float(unit[1])), self.origin[2]))
 
-    def nearest_from(self, position: Vector, heading: float) -> Proximity:
+    def nearest_from(self, position: Vector, heading: float, smoothing: float = 0.0) -> Proximity:
         """The same with the direction in the frame of a robot with this heading (rad)."""
-        distance, direction = self.nearest(position)
+        distance, direction = self.nearest(position, smoothing)
         return Proximity(distance, to_robot(direction, heading))
 
     def _is_occupied(self, place: NDArray[np.float64]) -> bool:
@@ -181,7 +194,7 @@ class LaserScan:
         if len(self.mount) != 3 or not all(map(math.isfinite, self.mount)):
             raise ValueError(f"mount: got {self.mount}, must be x, y (m) and heading (rad)")
 
-    def nearest(self, ignore: Sequence[Vector] = (), ignore_radius: float = 0.0) -> Proximity:
+    def nearest(self, ignore: Sequence[Vector] = (), ignore_radius: float = 0.0, smoothing: float = 0.0) -> Proximity:
         """The nearest of the points that the beams hit, from the robot's centre and in its frame.
 
         What is between two beams is not seen. Where nothing is hit, the distance is ``range_max`` and the direction is
@@ -191,6 +204,8 @@ class LaserScan:
             ignore: places in the robot's frame (m) where teammates are. Obstacles of the training are walls, teammates
                 it hears of, so a scan that shows both would not be what the policy knows.
             ignore_radius: around those places (m).
+            smoothing: the ``direction_smoothing`` that the policy was trained with (m); its differences are taken along
+                the robot's axes, not the world's.
         """
         ranges = np.asarray(self.ranges, float)
         ranges = np.where(np.isneginf(ranges), self.range_min, ranges)
@@ -205,5 +220,7 @@ class LaserScan:
         distances = np.hypot(*points.T)
         closest = int(distances.argmin())
         distance = float(distances[closest])
+        if smoothing > 0:
+            return Proximity(distance, _smoothed(lambda place: np.hypot(*(points - place).T).min(), (0, 0), smoothing))
         towards = points[closest] / distance if distance > 0 else np.zeros(2)
         return Proximity(distance, (float(towards[0]), float(towards[1])))

@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from redig.deploy.ros_state import to_quaternion
+from redig.deploy.ros_state import obstacle_vector, to_quaternion
 from redig.deploy.transport import BodyVelocity, Sensed
 from redig.files import replacing
 
@@ -91,13 +91,13 @@ class Recorder(AbstractContextManager):
         state, heading = sensed
         nanoseconds = round(state.stamp * 1e9)
         stamp = {"sec": nanoseconds // 10**9, "nanosec": nanoseconds % 10**9}
-        distance, (x, y) = state.obstacle_distance, state.obstacle_direction
+        wall = obstacle_vector(state.obstacle_distance, state.obstacle_direction)
         turned = dict(zip("xyzw", to_quaternion(heading), strict=True))
         parts: dict[str, dict[str, Any]] = {
             "pose": {"pose": {"position": _vector(*state.position), "orientation": turned}},
             "twist": {"twist": {"linear": _vector(*state.velocity), "angular": _vector()}},
             "goal": {"pose": {"position": _vector(*state.goal), "orientation": {**_vector(), "w": 1.0}}},
-            "obstacle": {"vector": _vector(distance * x, distance * y)},
+            "obstacle": {"vector": _vector(*wall)},
             "cmd_vel_stamped": {
                 "twist": {"linear": _vector(command.forward, command.left), "angular": _vector(z=command.turn)}
             },

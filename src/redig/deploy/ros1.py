@@ -17,6 +17,7 @@ from redig.deploy.ros_state import (
     Obstacle,
     StateParts,
     StateTransport,
+    obstacle_vector,
     to_quaternion,
     topic_names,
 )
@@ -69,11 +70,11 @@ class ROS1Transport(StateTransport):
         (state, heading), of = sensed, self._ros.messages
         stamp = self._ros.rospy.Time.from_sec(state.stamp)
         header = self._ros.header(stamp=stamp, frame_id=self._own.parts.frame)
-        distance, (x, y) = state.obstacle_distance, state.obstacle_direction
+        wall = of.Vector3(*obstacle_vector(state.obstacle_distance, state.obstacle_direction))
         place = of.Pose(of.Point(*state.position, 0.0), of.Quaternion(*to_quaternion(heading)))
         self._states["twist"].publish(header, of.Twist(linear=of.Vector3(*state.velocity, 0.0)))
         self._states["goal"].publish(header, of.Pose(position=of.Point(*state.goal, 0.0)))
-        self._states["obstacle"].publish(header, of.Vector3(distance * x, distance * y, 0.0))
+        self._states["obstacle"].publish(header, wall)
         self._states["pose"].publish(header, place)
 
     def command(self, velocity: BodyVelocity) -> None:

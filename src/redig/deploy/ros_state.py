@@ -63,7 +63,7 @@ class StateParts:
             self.goal = x, y
 
     def hear_obstacle(self, message: Any) -> None:
-        """A ``Vector3Stamped`` from the robot's centre to the nearest point of an obstacle (m)."""
+        """A ``Vector3Stamped`` of what :func:`obstacle_vector` says."""
         self._obstacle = message
 
     def take(self) -> Sensed | None:
@@ -79,7 +79,8 @@ class StateParts:
         if self._nearest is not None:
             distance, direction = self._nearest(position)
         else:
-            distance, direction = polar(_in_frame(vector.vector, vector.header.frame_id, self.frame, heading))
+            flat = _in_frame(vector.vector, vector.header.frame_id, self.frame, heading)
+            distance, direction = read_obstacle(*flat, vector.vector.z)
         return Sensed(RobotState(self.robot, stamp, position, velocity, self.goal, distance, direction), heading)
 
 
@@ -133,15 +134,31 @@ def topic_names(
     return robot, own, {mate: {name: f"{mate}/team/{name}" for name in STATE_TOPICS} for mate in mates if mate != robot}
 
 
-def polar(vector: Vector) -> tuple[float, Vector]:
-    """Length and direction of a vector; the direction of none is zeros.
+def obstacle_vector(distance: float, direction: Vector) -> tuple[float, float, float]:
+    """x, y, z of the ``Vector3`` that tells of a robot's nearest obstacle.
+
+    x and y lead from the robot's centre to the obstacle's nearest point (m). z is by how much the observed direction is
+    shorter than a unit vector, 0 to 1 (see :func:`~redig.envs.direction.smoothed_direction`), so whoever knows nothing
+    of that leaves it 0. A direction that is zero, or not known, is sent along x, with a z of 1.
 
     Examples:
-        >>> polar((3.0, 4.0))
-        (5.0, (0.6, 0.8))
+        >>> obstacle_vector(0.5, (0.0, 1.0)), obstacle_vector(0.5, (0.0, 0.25)), obstacle_vector(8.0, (0.0, 0.0))
+        ((0.0, 0.5, 0.0), (0.0, 0.5, 0.75), (8.0, 0.0, 1.0))
     """
-    length = math.hypot(*vector)
-    return (length, (vector[0] / length, vector[1] / length)) if length > 0 else (0.0, (0.0, 0.0))
+    length = math.hypot(*direction)
+    x, y = (direction[0] / length, direction[1] / length) if length > 0 else (1.0, 0.0)
+    return distance * x, distance * y, max(0.0, 1 - length)
+
+
+def read_obstacle(x: float, y: float, z: float = 0.0) -> tuple[float, Vector]:
+    """The inverse of :func:`obstacle_vector`; the direction of a vector without length is zeros.
+
+    Examples:
+        >>> read_obstacle(3.0, 4.0), read_obstacle(0.0, 0.5, 0.75)
+        ((5.0, (0.6, 0.8)), (0.5, (0.0, 0.25)))
+    """
+    distance, length = math.hypot(x, y), 1 - min(max(z, 0.0), 1.0)
+    return (distance, (length * x / distance, length * y / distance)) if distance > 0 else (0.0, (0.0, 0.0))
 
 
 def yaw(quaternion: Any) -> float:

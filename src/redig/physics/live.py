@@ -11,6 +11,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from redig.deploy.messages import RobotState
 from redig.deploy.transport import BodyVelocity, Sensed
+from redig.envs.direction import smoothed_direction
 from redig.envs.maps import ObstacleMap
 from redig.physics.world import PhysicsWorld
 
@@ -38,6 +39,7 @@ class LiveTeam:
         network: to reach them by.
         limits: largest forward (m/s) and turning (rad/s) speed that the bodies accept.
         watchdog: (s), of the physics.
+        direction_smoothing: that the robots' policy was trained with (m).
 
     Raises:
         ValueError: if there is not a name for each robot.
@@ -66,11 +68,13 @@ class LiveTeam:
         network: _Network,
         limits: tuple[float, float] = (1.2, 6.0),
         watchdog: float = 0.5,
+        direction_smoothing: float = 0.0,
     ) -> None:
         if len(robots) != world.n_robots:
             raise ValueError(f"robots: got {len(robots)} names for {world.n_robots} robots")
         self.world, self.robots, self.watchdog = world, list(robots), watchdog
         self._map, self._network, self._limits = obstacle_map, network, np.array(limits)
+        self._smoothing = direction_smoothing
 
     def reset(self, position: ArrayLike, heading: ArrayLike, goal: ArrayLike, now: float) -> None:
         """Put the robots at a start, at rest; commands that are under way are dropped.
@@ -107,7 +111,10 @@ class LiveTeam:
     def sensed(self, now: float) -> list[Sensed]:
         """What each robot senses, stamped ``now`` (s)."""
         position, velocity, heading = self.world.position, self.world.velocity, self.world.heading
-        distance, direction = self._map.nearest(torch.as_tensor(position, dtype=torch.float32))
+        place = torch.as_tensor(position, dtype=torch.float32)
+        distance, direction = self._map.nearest(place)
+        if self._smoothing:
+            direction = smoothed_direction(self._map, place, self._smoothing)
         team = []
         for i, robot in enumerate(self.robots):
             place, speed, goal, wall = (_pair(x[i]) for x in (position, velocity, self._goal, direction.numpy()))
