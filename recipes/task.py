@@ -58,7 +58,7 @@ class Task:
     """Steps of 0.1 s until a team's episode is cut; a longer map may need more."""
     observe_direction: bool = True
     """Observe the direction to the nearest obstacle; without it the state is the paper's seven numbers."""
-    direction_smoothing: float = 0.1
+    direction_smoothing: float = 0.05
     """How far to either side of where the nearest obstacle changes that direction turns (m); 0: it jumps there, and
     robots tremble on the midline of a corridor."""
 
