@@ -34,7 +34,7 @@ def smoothed_direction(obstacle_map: AnyMap, point: Tensor, reach: float) -> Ten
     """
     if not reach > 0:
         raise ValueError(f"reach: got {reach}, must be greater than 0 m")
-    steps = reach * torch.eye(2, dtype=point.dtype, device=point.device)
-    distance = obstacle_map.signed_distance
-    slope = torch.stack([distance(point - step) - distance(point + step) for step in steps], -1) / (2 * reach)
+    along = reach * torch.eye(2, dtype=point.dtype, device=point.device).view(2, *[1] * (point.ndim - 1), 2)
+    ahead, behind = obstacle_map.signed_distance(torch.stack([point + along, point - along]))  # each [2, *B]
+    slope = (behind - ahead).movedim(0, -1) / (2 * reach)
     return slope / slope.norm(dim=-1, keepdim=True).clamp_min(1)
