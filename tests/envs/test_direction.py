@@ -7,8 +7,7 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
-from redig.envs import MapBatch, ObstacleMap, make_env, named_map
-from redig.envs.direction import smoothed_direction
+from redig.envs import MapBatch, ObstacleMap, make_env, named_map, smoothed_direction
 from redig.envs.maps import corridor
 from redig.envs.occupancy import OccupancyMap
 

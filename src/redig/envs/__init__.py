@@ -1,6 +1,7 @@
 """Environments: formations, maps, rewards and the VMAS scenario made of them."""
 
 from redig.envs.action_check import ActionCheck
+from redig.envs.direction import smoothed_direction
 from redig.envs.factory import make_env
 from redig.envs.formations import FORMATIONS, formation_integrity, formation_offsets, pairwise_distances
 from redig.envs.map_batch import MapBatch
@@ -38,4 +39,5 @@ __all__ = [
     "pairwise_distances",
     "passages",
     "random_map",
+    "smoothed_direction",
 ]
