@@ -21,7 +21,7 @@ def smoothed_direction(obstacle_map: AnyMap, point: Tensor, reach: float) -> Ten
         reach: h, how far to either side the differences reach (m).
 
     Returns:
-        ``[*B, 2]``, of a length of at most 1: where differences around a corner make it longer, it is cut.
+        ``[*B, 2]``, of a length of at most 1, to which it is cut where differences around a corner make it longer.
 
     Raises:
         ValueError: if ``reach`` is not positive.
