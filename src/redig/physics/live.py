@@ -111,10 +111,10 @@ class LiveTeam:
     def sensed(self, now: float) -> list[Sensed]:
         """What each robot senses, stamped ``now`` (s)."""
         position, velocity, heading = self.world.position, self.world.velocity, self.world.heading
-        place = torch.as_tensor(position, dtype=torch.float32)
-        distance, direction = self._map.nearest(place)
+        centres = torch.as_tensor(position, dtype=torch.float32)
+        distance, direction = self._map.nearest(centres)
         if self._smoothing:
-            direction = smoothed_direction(self._map, place, self._smoothing)
+            direction = smoothed_direction(self._map, centres, self._smoothing)
         team = []
         for i, robot in enumerate(self.robots):
             place, speed, goal, wall = (_pair(x[i]) for x in (position, velocity, self._goal, direction.numpy()))
