@@ -12,7 +12,8 @@ from redig.evaluation import rollout_trajectories
 from redig.pace import Paced
 from redig.policy import PolicyConfig, build_policy, save_policy
 
-CONFIG = PolicyConfig(observation_dim=9, sampling_steps=5, noise_ratio=0.0, hidden=(32, 32))
+# a linear schedule: the first step of a cosine one magnifies rounding, which differs between a team and one robot
+CONFIG = PolicyConfig(observation_dim=9, sampling_steps=5, noise_ratio=0.0, hidden=(32, 32), schedule="linear")
 
 
 @pytest.fixture(scope="module")
@@ -55,9 +56,7 @@ def test_one_robot_does_what_its_team_would(policy, tmp_path_factory, pace, seed
     states = [RobotState.of_observation(f"robot_{i}", 0.0, row) for i, row in enumerate(observation[0].tolist())]
     robot = RobotPolicy(ModulePolicy(path), pace)
     for i, own in enumerate(states):
-        command = robot(own, states[:i] + states[i + 1 :])
-        # the state is scaled in double precision there and in single here, which a random network magnifies
-        np.testing.assert_allclose(command, commands[i].detach(), atol=1e-4)
+        np.testing.assert_allclose(robot(own, states[:i] + states[i + 1 :]), commands[i].detach(), atol=1e-5)
 
 
 @pytest.mark.parametrize("pace", [0.0, -1.0, 1.5, float("nan")])

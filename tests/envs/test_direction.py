@@ -11,8 +11,6 @@ from redig.envs import MapBatch, ObstacleMap, make_env, named_map, smoothed_dire
 from redig.envs.maps import corridor
 from redig.envs.occupancy import OccupancyMap
 
-OBSERVATION = ("agents", "observation")
-
 
 @given(st.floats(-0.5, 0.5), st.floats(-0.3, 0.3), st.floats(0.02, 0.2), st.floats(-3, 3))
 def test_across_a_corridor_it_is_the_slope_of_two_walls_whatever_the_heading(y, x, reach, angle):

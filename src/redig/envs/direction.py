@@ -38,3 +38,25 @@ def smoothed_direction(obstacle_map: AnyMap, point: Tensor, reach: float) -> Ten
     ahead, behind = obstacle_map.signed_distance(torch.stack([point + along, point - along]))  # each [2, *B]
     slope = (behind - ahead).movedim(0, -1) / (2 * reach)
     return slope / slope.norm(dim=-1, keepdim=True).clamp_min(1)
+
+
+def observed_obstacle(obstacle_map: AnyMap, point: Tensor, smoothing: float = 0.0) -> tuple[Tensor, Tensor]:
+    """What a robot at ``point`` ``[*B, 2]`` (m) observes of obstacles.
+
+    Args:
+        obstacle_map: with a signed distance.
+        point: ``[*B, 2]`` (m).
+        smoothing: reach of :func:`smoothed_direction` (m); 0: the unit vector.
+
+    Returns:
+        signed distance to the nearest ``[*B]`` (m), and the direction to it ``[*B, 2]``
+
+    Examples:
+        >>> from redig.envs.maps import corridor
+        >>> distance, direction = observed_obstacle(corridor(1.1), torch.tensor([0.0, 0.05]), smoothing=0.1)
+        >>> round(distance.item(), 3), round(direction[1].item(), 3)
+        (0.5, 0.5)
+    """
+    if smoothing == 0:
+        return obstacle_map.nearest(point)
+    return obstacle_map.signed_distance(point), smoothed_direction(obstacle_map, point, smoothing)

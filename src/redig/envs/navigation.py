@@ -8,7 +8,7 @@ from vmas.simulator.core import Agent, Sphere, World
 from vmas.simulator.scenario import BaseScenario
 
 from redig.envs import rewards, starts
-from redig.envs.direction import smoothed_direction
+from redig.envs.direction import observed_obstacle
 from redig.envs.dynamics import leave_walls, part_robots
 from redig.envs.formation_reward import FORMATION_REWARDS, formation_reward
 from redig.envs.formations import formation_offsets, pairwise_distances
@@ -278,10 +278,9 @@ class FormationNavigation(BaseScenario):
         terminated: Tensor | None = None,
     ) -> dict[str, Tensor]:
         zero = position.new_zeros(position.shape[:2])
-        distance, direction = self.obstacle_map.nearest(position)
+        smoothing = self.direction_smoothing if self.observe_direction else 0.0
+        distance, direction = observed_obstacle(self.obstacle_map, position, smoothing)
         observation = [position, velocity, self.goal - position, distance.unsqueeze(-1)]
-        if self.direction_smoothing:
-            direction = smoothed_direction(self.obstacle_map, position, self.direction_smoothing)
         if self.observe_direction:
             observation.append(direction)
         names = ("navigation_reward", "formation_reward", "arrival_reward", "collision_reward")

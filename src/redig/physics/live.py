@@ -11,7 +11,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from redig.deploy.messages import RobotState
 from redig.deploy.transport import BodyVelocity, Sensed
-from redig.envs.direction import smoothed_direction
+from redig.envs.direction import observed_obstacle
 from redig.envs.maps import ObstacleMap
 from redig.physics.world import PhysicsWorld
 
@@ -112,9 +112,7 @@ class LiveTeam:
         """What each robot senses, stamped ``now`` (s)."""
         position, velocity, heading = self.world.position, self.world.velocity, self.world.heading
         centres = torch.as_tensor(position, dtype=torch.float32)
-        distance, direction = self._map.nearest(centres)
-        if self._smoothing:
-            direction = smoothed_direction(self._map, centres, self._smoothing)
+        distance, direction = observed_obstacle(self._map, centres, self._smoothing)
         team = []
         for i, robot in enumerate(self.robots):
             place, speed, goal, wall = (_pair(x[i]) for x in (position, velocity, self._goal, direction.numpy()))
