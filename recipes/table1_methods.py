@@ -37,11 +37,13 @@ class Method:
     """Where it differs from the other methods."""
 
 
-# Earlier defaults: the observed direction to obstacles jumps on midlines; and robots of the demonstrations drive at
-# speeds of their own (of the line that is still the default)
-JUMPS = ("--direction-smoothing", "0")
+# Earlier defaults: a wedge's formation reward reaches as far as 0.5 m (circle's and line's still does); that, and the
+# observed direction to obstacles jumps on midlines; that, and robots of the demonstrations drive at speeds of their own
+# (of the line they still do)
+LENIENT = ("--formation-tolerance", "0.5")
+JUMPS = ("--direction-smoothing", "0", *LENIENT)
 SLOWER = ("--demonstration-speed", "0.5", "1", *JUMPS)
-LINE, NOT_LINE = ("line",), ("circle", "wedge")
+WEDGE, LINE, NOT_LINE = ("wedge",), ("line",), ("circle", "wedge")
 
 # What suits PPO that starts from a clone (docs/results/ppo)
 PPO_CLONED = (
@@ -61,6 +63,10 @@ METHODS: dict[str, Method] = {
     "redig_coordinated": Method("ReDiG, coordinated demonstrations", "redig_wedge.py", ("--coordinated", *JUMPS)),
     "gaussian": Method("Gaussian actor, trained as ReDiG", "redig_wedge.py", GAUSSIAN),
     "deterministic": Method("deterministic actor, trained as ReDiG", "redig_wedge.py", DETERMINISTIC),
+    "redig_lenient": Method("ReDiG, tolerance 0.5 m", "redig_wedge.py", LENIENT, formations=WEDGE),
+    "ppo_cloned_lenient": Method(
+        "PPO from a clone, tolerance 0.5 m", "ppo_gnn.py", (*PPO_CLONED, *LENIENT), formations=WEDGE
+    ),
     "redig_jumps": Method("ReDiG, direction that jumps", "redig_wedge.py", JUMPS),
     "gaussian_jumps": Method(
         "Gaussian actor, direction that jumps", "redig_wedge.py", (*GAUSSIAN, *JUMPS), formations=LINE

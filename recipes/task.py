@@ -13,10 +13,16 @@ from redig.envs.random_maps import MAP_KINDS
 # What suits each formation: too much weight, and a team keeps its shape rather than arrive; the bonus hurries it on.
 # Robots that plan alone at one speed collide in a line, as all reach the corridor at once; at their own they do less.
 SUITS: dict[str, dict[str, Any]] = {
-    "wedge": {"formation_weight": 3.5, "arrival_bonus": 20.0, "demonstration_speed": (0.9, 1.0)},
-    "line": {"formation_weight": 1.0, "arrival_bonus": 10.0, "demonstration_speed": (0.5, 1.0)},
-    "circle": {"formation_weight": 2.0, "arrival_bonus": 20.0, "demonstration_speed": (0.9, 1.0)},
-}
+    "wedge": {
+        "formation_weight": 3.5, "formation_tolerance": 0.25, "arrival_bonus": 20.0, "demonstration_speed": (0.9, 1.0),
+    },
+    "line": {
+        "formation_weight": 1.0, "formation_tolerance": 0.5, "arrival_bonus": 10.0, "demonstration_speed": (0.5, 1.0),
+    },
+    "circle": {
+        "formation_weight": 2.0, "formation_tolerance": 0.5, "arrival_bonus": 20.0, "demonstration_speed": (0.9, 1.0),
+    },
+}  # fmt: skip
 
 
 @dataclass
@@ -67,6 +73,9 @@ class Task:
     """scaled, slanted, integrity (tau of the CFI), spring_damper_bonus, spring_damper (Eq. 29) or none."""
     formation_weight: float | None = None
     """Weight of the formation reward against progress in m/s; default: what suits the formation."""
+    formation_tolerance: float | None = None
+    """How far from its place in the formation a robot's bonus is gone (m), of scaled and slanted; default: what suits
+    the formation."""
     omega: float = 0.8
     """Balance of spring and damper in the spring-damper forms (paper: 0.5)."""
     navigation_reward: str = "progress"
@@ -115,8 +124,8 @@ class Task:
         names = (
             "formation", "n_robots", "formation_width", "corridor_width", "corridor_length", "max_speed",
             "max_acceleration", "observe_direction", "direction_smoothing", "formation_reward", "formation_weight",
-            "omega", "navigation_reward", "time_cost", "arrival_bonus", "collision_penalty", "proximity_penalty",
-            "collision_terminates", "arrival_terminates",
+            "formation_tolerance", "omega", "navigation_reward", "time_cost", "arrival_bonus", "collision_penalty",
+            "proximity_penalty", "collision_terminates", "arrival_terminates",
         )  # fmt: skip
         arguments = {name: getattr(self, name) for name in names}
         if self.max_steps != Task.max_steps:  # files from before there was a choice say nothing of it

@@ -103,6 +103,7 @@ def main(arguments: Arguments) -> dict[str, Rows]:
         num_trajectories=arguments.trajectories,
         demonstration_speed=(0.5, 1.0),
         direction_smoothing=0.0,
+        formation_tolerance=0.5,
         clone_updates=arguments.clone_updates,
         critic_updates=arguments.updates,
         clone_batch=32,

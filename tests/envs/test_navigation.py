@@ -8,6 +8,7 @@ from torchrl.envs import check_env_specs
 from redig.envs import curve, formation_offsets, make_env, pairwise_distances
 from redig.envs.formation_reward import FORMATION_REWARDS
 from redig.envs.maps import ObstacleMap
+from redig.envs.rewards import best_lateral_scale
 
 PARTS = ("navigation_reward", "formation_reward", "arrival_reward", "collision_reward")
 
@@ -110,6 +111,13 @@ def test_reward_weights_and_variants_against_positions_and_velocities():
 
     info = rollout(formation_reward="scaled", formation_weight=0.25)  # the team moves as one, in formation
     torch.testing.assert_close(info["formation_reward"], torch.full((2, 12, 5), 0.25), atol=1e-3, rtol=0)
+
+    for tolerance in (0.1, 0.5):  # robots of different paces leave their places by up to 0.18 m
+        info = rollout(paces, formation_reward="scaled", formation_weight=0.25, formation_tolerance=tolerance)
+        ahead = torch.tensor([1.0, 0.0]).expand(*info["position"].shape[:-2], 2)
+        scale, residual = best_lateral_scale(info["position"], formation_offsets("wedge", 5), ahead)
+        expected = 1 - (residual / tolerance).clamp_max(1) - 0.5 * (1 - scale).clamp_min(0).unsqueeze(-1)
+        torch.testing.assert_close(info["formation_reward"], 0.25 * expected, atol=1e-4, rtol=0)
 
     info = rollout(navigation_reward="progress")
     gained = (info["navigation_reward"] * 0.1).sum(1)
@@ -367,6 +375,7 @@ def test_a_saved_state_continues_as_if_nothing_had_happened():
             for name in ("radius", "dt", "max_speed", "max_acceleration", "goal_radius", "proximity_margin")
             for value in (0.0, math.nan)
         ),
+        ({"formation_tolerance": 0.0}, r"formation_tolerance: got 0\.0, must be greater than 0"),
         ({"start_distance": -2.0}, r"start_distance: got -2\.0, must be greater than 0"),
         ({"max_speed": 1.5}, r"max_speed: got 1\.5 m/s, .* more than its radius \(0\.1 m\)"),
     ],

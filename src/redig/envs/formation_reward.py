@@ -18,6 +18,7 @@ def formation_reward(
     offsets: Tensor,
     direction: Tensor,
     omega: float = 0.5,
+    tolerance: float = 0.5,
 ) -> Tensor:
     """The formation reward of each robot, of one of the kinds in :mod:`redig.envs.rewards`.
 
@@ -29,6 +30,7 @@ def formation_reward(
         offsets: the formation ``[n, 2]`` (m).
         direction: unit vector of travel ``[B, 2]``.
         omega: balance of spring and damper.
+        tolerance: how far from its place (m) the bonus of a robot is gone, of ``scaled`` and ``slanted``.
 
     Returns:
         ``[B, n]``; the same for every robot where the reward is the team's.
@@ -45,9 +47,9 @@ def formation_reward(
         tensor([[1., 1., 1., 1., 1.]])
     """
     if kind == "scaled":
-        return rewards.scaled_formation_bonus(position, offsets, direction)
+        return rewards.scaled_formation_bonus(position, offsets, direction, tolerance)
     if kind == "slanted":
-        return rewards.slanted_formation_bonus(position, offsets, direction)
+        return rewards.slanted_formation_bonus(position, offsets, direction, tolerance)
     if kind == "integrity":
         team = rewards.integrity_bonus(formation, position, offsets, direction)
         return team.unsqueeze(-1).expand(-1, len(offsets))

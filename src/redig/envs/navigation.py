@@ -46,10 +46,11 @@ class FormationNavigation(BaseScenario):
       ``direction_smoothing`` (m): how far to either side of where the nearest obstacle changes that vector turns, see
       :func:`~redig.envs.direction.smoothed_direction`; 0: it jumps.
     * ``formation_reward``: one of ``spring_damper`` (Eq. 29), ``spring_damper_bonus``, ``scaled``, ``slanted``,
-      ``integrity``, ``none``; ``formation_weight``; ``omega``. The frame of ``scaled`` and ``slanted`` is the goal's
-      heading, so that the goal itself is a perfect formation. On a route it is turned back by as much as the route
-      turns between the team's centroid and the goal, so that a team is squeezed across the path wherever it is; on a
-      straight one that is nothing. The contextual formation integrity has no frame.
+      ``integrity``, ``none``; ``formation_weight``; ``omega``; ``formation_tolerance`` (m): how far from its place a
+      robot's bonus is gone, of ``scaled`` and ``slanted``. The frame of these two is the goal's heading, so that the
+      goal itself is a perfect formation. On a route it is turned back by as much as the route turns between the team's
+      centroid and the goal, so that a team is squeezed across the path wherever it is; on a straight one that is
+      nothing. The contextual formation integrity has no frame.
     * ``navigation_reward``: ``goal_speed`` (Eq. 30) or ``progress``, both as the crow flies: along an arc of less than
       half a circle every step still pays; ``time_cost``, taken from it at each step until the robot arrives;
       ``arrival_bonus``, ``goal_radius`` (m); ``collision_penalty``; ``proximity_penalty`` and ``proximity_margin``
@@ -129,6 +130,7 @@ class FormationNavigation(BaseScenario):
         self.direction_smoothing = take("direction_smoothing", 0.0)
         self.formation_reward = take("formation_reward", "spring_damper")
         self.formation_weight, self.omega = take("formation_weight", 1.0), take("omega", 0.5)
+        self.formation_tolerance = take("formation_tolerance", 0.5)
         self.navigation_reward = take("navigation_reward", "goal_speed")
         self.time_cost = take("time_cost", 0.0)
         self.arrival_bonus, self.goal_radius = take("arrival_bonus", 15.0), take("goal_radius", 0.1)
@@ -145,6 +147,7 @@ class FormationNavigation(BaseScenario):
             "goal_radius",
             "proximity_margin",
             "start_distance",
+            "formation_tolerance",
         )
         for name in positive:
             if not getattr(self, name) > 0:
@@ -225,7 +228,7 @@ class FormationNavigation(BaseScenario):
             navigation = rewards.progress(self.previous_position, position, self.goal, self.dt)
         else:
             navigation = rewards.goal_speed(position, velocity, self.goal)
-        shape = self.offsets, self._travel_direction(position), self.omega
+        shape = self.offsets, self._travel_direction(position), self.omega, self.formation_tolerance
         bonus = formation_reward(self.formation_reward, self.formation, position, velocity, *shape)
         parts = {
             "navigation_reward": (navigation - self.time_cost) * moving,

@@ -146,6 +146,7 @@ def slanted_formation_bonus(
     position: Tensor,
     offsets: Tensor,
     direction: Tensor,
+    tolerance: float = 0.5,
     slant_cost: float = 0.1,
     steepest: float = 1.5,
 ) -> Tensor:
@@ -159,6 +160,7 @@ def slanted_formation_bonus(
         position: ``[*B, n, 2]`` (m).
         offsets: the formation ``[n, 2]`` (m).
         direction: unit vector of travel ``[*B, 2]``.
+        tolerance: residual (m) at which a robot's bonus is gone.
         slant_cost: price of a slant of one; it makes the team straighten up again.
         steepest: largest slant, to either side.
 
@@ -176,7 +178,7 @@ def slanted_formation_bonus(
     forward = (position * direction.unsqueeze(-2)).sum(-1)
     slant = ((forward * offsets[:, 1]).sum(-1) / offsets[:, 1].square().sum()).clamp(-steepest, steepest).unsqueeze(-1)
     upright = position - (slant * offsets[:, 1]).unsqueeze(-1) * direction.unsqueeze(-2)
-    return scaled_formation_bonus(upright, offsets, direction) - slant_cost * slant.abs()
+    return scaled_formation_bonus(upright, offsets, direction, tolerance) - slant_cost * slant.abs()
 
 
 def integrity_bonus(
