@@ -77,18 +77,23 @@ METHODS: dict[str, Method] = {
     "ppo_cloned_jumps": Method(
         "PPO from a clone, direction that jumps", "ppo_gnn.py", (*PPO_CLONED, *JUMPS), formations=LINE
     ),
-    "redig_slower": Method("ReDiG, that and slower demonstrations", "redig_wedge.py", SLOWER, formations=NOT_LINE),
+    "redig_slower": Method(
+        "ReDiG, slower demonstrations, direction that jumps", "redig_wedge.py", SLOWER, formations=NOT_LINE
+    ),
     "gaussian_slower": Method(
-        "Gaussian actor, that and slower demonstrations", "redig_wedge.py", (*GAUSSIAN, *SLOWER), formations=NOT_LINE
+        "Gaussian actor, slower demonstrations, direction that jumps",
+        "redig_wedge.py",
+        (*GAUSSIAN, *SLOWER),
+        formations=NOT_LINE,
     ),
     "deterministic_slower": Method(
-        "deterministic actor, that and slower demonstrations",
+        "deterministic actor, slower demonstrations, direction that jumps",
         "redig_wedge.py",
         (*DETERMINISTIC, *SLOWER),
         formations=NOT_LINE,
     ),
     "ppo_cloned_slower": Method(
-        "PPO from a clone, that and slower demonstrations",
+        "PPO from a clone, slower demonstrations, direction that jumps",
         "ppo_gnn.py",
         (*PPO_CLONED, *SLOWER),
         formations=NOT_LINE,
