@@ -24,6 +24,9 @@ SUITS: dict[str, dict[str, Any]] = {
     },
 }  # fmt: skip
 
+# What runs were trained with whose configuration, from before there was a choice, says nothing of it
+BEFORE: dict[str, Any] = {"direction_smoothing": 0.0, "formation_tolerance": 0.5}
+
 
 @dataclass
 class Task:
@@ -164,7 +167,9 @@ class Task:
         path = self.resume / "config.json" if self.resume else None
         if path is None or not path.is_file():
             raise FileNotFoundError(f"resume: {self.resume} holds no run (no config.json)")
-        return dataclasses.replace(self, **{**json.loads(path.read_text()), "resume": self.resume, "out": None})
+        return dataclasses.replace(
+            self, **{**BEFORE, **json.loads(path.read_text()), "resume": self.resume, "out": None}
+        )
 
     def filled(self, defaults: dict[str, Any]) -> Self:
         """This configuration with ``defaults`` in place of what is None."""

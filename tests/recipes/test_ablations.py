@@ -76,6 +76,17 @@ def test_the_paper_as_printed_trains_at_toy_size(tmp_path, monkeypatch):
     assert all(saved[name] == value for name, value in PAPER.items() if name not in SMOKE)
 
 
+def test_a_run_from_before_there_was_a_choice_goes_on_as_it_was(tmp_path):
+    config = Config(resume=tmp_path)
+    given = json.loads(json.dumps(dataclasses.asdict(Config(seed=3).resolve()), default=str))
+    (tmp_path / "config.json").write_text(json.dumps(given))
+    assert (config.saved().direction_smoothing, config.saved().formation_tolerance) == (0.05, 0.25)
+    old = {name: value for name, value in given.items() if name not in ("direction_smoothing", "formation_tolerance")}
+    (tmp_path / "config.json").write_text(json.dumps(old))
+    assert (config.saved().direction_smoothing, config.saved().formation_tolerance) == (0.0, 0.5)
+    assert config.saved().seed == 3
+
+
 def test_each_formation_has_the_demonstrations_that_suit_it():
     speeds = {name: Config(formation=name).resolve().demonstration_speed for name in ("wedge", "circle", "line")}
     assert speeds == {"wedge": (0.9, 1.0), "circle": (0.9, 1.0), "line": (0.5, 1.0)}
