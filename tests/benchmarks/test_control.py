@@ -5,14 +5,14 @@ import pytest
 
 
 def test_toy_run(tmp_path):
-    arguments = control.Arguments(steps=(3,), starts=2, repeats=2, out=tmp_path)
+    arguments = control.Arguments(steps=(3, 2), starts=2, repeats=2, out=tmp_path)
     rates, quality = control.main(arguments)
-    assert [row["steps"] for row in rates] == [row["steps"] for row in quality] == [3]
+    assert [row["steps"] for row in rates] == [row["steps"] for row in quality] == [3, 2]
     assert all(row[f"{form} (Hz)"] > 0 for row in rates for form in ("team, module", control.TEAM, control.ROBOT))
     assert quality[0]["team_success_rate"] == 1
     for name in ("control", "control_quality"):
         with open(tmp_path / f"{name}.csv") as file:
-            assert len(list(csv.DictReader(file))) == 1
+            assert len(list(csv.DictReader(file))) == 2
 
 
 def test_distance_to_the_reference():

@@ -78,7 +78,7 @@ def test_the_paper_as_printed_trains_at_toy_size(tmp_path, monkeypatch):
 
 def test_a_run_from_before_there_was_a_choice_goes_on_as_it_was(tmp_path):
     config = Config(resume=tmp_path)
-    given = json.loads(json.dumps(dataclasses.asdict(Config(seed=3).resolve()), default=str))
+    given = dataclasses.asdict(Config(seed=3).resolve())
     (tmp_path / "config.json").write_text(json.dumps(given))
     assert (config.saved().direction_smoothing, config.saved().formation_tolerance) == (0.05, 0.25)
     old = {name: value for name, value in given.items() if name not in ("direction_smoothing", "formation_tolerance")}
