@@ -223,7 +223,7 @@ def test_ppo_finds_a_known_answer():
             return (policy(data)[ACTION] - answer).square().mean().sqrt().item()
 
     untrained = error()
-    for _ in range(40):
+    for _ in range(25):
         data, answer = world(256)
         with torch.no_grad():
             policy(data)
@@ -236,6 +236,7 @@ def test_ppo_finds_a_known_answer():
         for batch in ppo_gnn.minibatches(ppo_gnn.advantages(loss, data), config.epochs, config.batch_size):
             optimizer.zero_grad()
             sum(ppo_gnn.loss_terms(loss, batch).values()).backward()
+            torch.nn.utils.clip_grad_norm_(loss.parameters(), config.grad_norm)  # without it some seeds diverge late
             optimizer.step()
     assert untrained > 0.3
     assert error() < 0.1
