@@ -23,9 +23,9 @@ COORDINATED: dict[str, Any] = {  # what suits demonstrations worth keeping to: s
     "final_share": 0.5,
 }  # fmt: skip
 SMOKE: dict[str, Any] = {  # the whole program in under a minute; it learns nothing
-    "num_trajectories": 100, "clone_updates": 20, "critic_updates": 20, "warmup_steps": 20, "env_steps": 40,
-    "evaluation_interval": 20, "evaluation_starts": 8, "num_starts": 8, "num_envs": 8, "hidden": 32,
-    "max_steps": 50,
+    "num_trajectories": 20, "clone_updates": 20, "critic_updates": 20, "warmup_steps": 10, "env_steps": 20,
+    "collect_steps": 10, "evaluation_interval": 10, "evaluation_starts": 8, "num_starts": 8, "num_envs": 8,
+    "hidden": 32, "max_steps": 50,
 }  # fmt: skip
 
 

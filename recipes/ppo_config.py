@@ -15,7 +15,7 @@ METHODS: dict[str, dict[str, Any]] = {
     "afor_redig_reward": {},
 }
 SMOKE: dict[str, Any] = {  # the whole program in under a minute; it learns nothing
-    "num_trajectories": 50, "clone_updates": 4, "frames": 640, "horizon": 20, "epochs": 1, "num_envs": 8,
+    "num_trajectories": 20, "clone_updates": 4, "frames": 640, "horizon": 20, "epochs": 1, "num_envs": 8,
     "evaluation_interval": 40, "evaluation_starts": 8, "num_starts": 8, "hidden": 32,
     "max_steps": 50,
 }  # fmt: skip

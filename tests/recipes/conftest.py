@@ -1,3 +1,4 @@
+import runpy
 import subprocess
 import sys
 from pathlib import Path
@@ -10,6 +11,21 @@ sys.path.insert(0, str(RECIPES))
 
 def command(name, *arguments):
     return [sys.executable, str(RECIPES / name), *map(str, arguments)]
+
+
+@pytest.fixture
+def printed_help(monkeypatch, capsys):
+    """What a recipe prints when it is run with ``--help``, in this process, which has its imports already."""
+
+    def printed(name):
+        monkeypatch.setattr(sys, "argv", [name, "--help"])
+        monkeypatch.setenv("COLUMNS", "200")
+        with pytest.raises(SystemExit) as end:
+            runpy.run_path(str(RECIPES / name), run_name="__main__")
+        assert end.value.code == 0
+        return capsys.readouterr().out
+
+    return printed
 
 
 @pytest.fixture(scope="session")
