@@ -74,9 +74,6 @@ METHODS: dict[str, Method] = {
     "deterministic_jumps": Method(
         "deterministic actor, direction that jumps", "redig_wedge.py", (*DETERMINISTIC, *JUMPS), formations=LINE
     ),
-    "ppo_cloned_jumps": Method(
-        "PPO from a clone, direction that jumps", "ppo_gnn.py", (*PPO_CLONED, *JUMPS), formations=LINE
-    ),
     "redig_slower": Method(
         "ReDiG, slower demonstrations, direction that jumps", "redig_wedge.py", SLOWER, formations=NOT_LINE
     ),
@@ -90,12 +87,6 @@ METHODS: dict[str, Method] = {
         "deterministic actor, slower demonstrations, direction that jumps",
         "redig_wedge.py",
         (*DETERMINISTIC, *SLOWER),
-        formations=NOT_LINE,
-    ),
-    "ppo_cloned_slower": Method(
-        "PPO from a clone, slower demonstrations, direction that jumps",
-        "ppo_gnn.py",
-        (*PPO_CLONED, *SLOWER),
         formations=NOT_LINE,
     ),
     "cloned": Method("ReDiG before online training", of="redig", file="cloned.safetensors"),
