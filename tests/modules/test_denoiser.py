@@ -178,6 +178,6 @@ def test_a_batch_taken_in_pieces_has_the_same_values(activation):
     denoiser = DenoisingMLP(2, 6, (128, 64), activation=activation)
     action, embedding = torch.randn(1001, 5, 2), torch.randn(1001, 5, 6)
     with torch.no_grad():
-        assert rows_at_once(torch.zeros(1001, 5, 128)) == 2048  # 5005 rows: two whole pieces and a rest
+        assert rows_at_once(torch.zeros(1001, 5, 2), 128) == 2048  # 5005 rows: two whole pieces and a rest
         found = denoiser.prepare(embedding, [3])(action, 3)
         torch.testing.assert_close(found, denoiser(action, torch.tensor(3), embedding), atol=1e-6, rtol=0)

@@ -210,3 +210,14 @@ def test_wrong_observation_width(kind, aggregation):
     ):
         with pytest.raises(ValueError, match=r"observation: got shape \[.*3, 7\], expected \[\*B, n, 5\]"):
             call(torch.zeros(2, 3, 7, dtype=torch.float64))
+
+
+@variants
+@pytest.mark.parametrize(("n", "batch", "pieces"), [(5, (150, 20), True), (1, (30_000, 2), True), (5, (2, 3), False)])
+def test_a_large_batch_of_teams_taken_in_pieces_has_the_same_embeddings(kind, aggregation, n, batch, pieces):
+    encoder = make(kind, aggregation).float()
+    state = teams(n, 0, batch).float()
+    with torch.no_grad():
+        assert (encoder._teams_at_once(encoder.lift(state)) is not None) == pieces
+        found = encoder(state)
+    torch.testing.assert_close(found, encoder(state).detach(), atol=1e-5, rtol=0)  # with gradients it takes all at once

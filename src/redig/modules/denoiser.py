@@ -91,24 +91,31 @@ def quick_mish_pays(x: Tensor) -> bool:
         ...     [quick_mish_pays(torch.zeros(robots, 128)) for robots in (5, 260, 20_480)]
         [False, True, False]
     """
-    return _eager_on_cpu(x) and 2**13 <= x.numel() <= 2**19
+    return eager_on_cpu(x) and 2**13 <= x.numel() <= 2**19
 
 
-def rows_at_once(x: Tensor) -> int | None:
+def rows_at_once(x: Tensor, width: int) -> int | None:
     """How many rows of a large batch to take through a network at a time, to stay in a cache; None: all of them.
 
     Measured on a CPU in float32: a chain of a million numbers takes half the time in pieces.
 
+    Args:
+        x: ``[*B, W]``, a row for each of ``*B``.
+        width: how many numbers the network has in the middle for each row.
+
     Examples:
         >>> import torch
         >>> with torch.no_grad():
-        ...     [rows_at_once(torch.zeros(robots, 128)) for robots in (5, 20_480)]
+        ...     [rows_at_once(torch.zeros(robots, 2), width=128) for robots in (5, 20_480)]
         [None, 2048]
     """
-    return 2**18 // x.shape[-1] if _eager_on_cpu(x) and x.numel() > 2**19 and x.shape[-1] <= 2**18 else None
+    if not eager_on_cpu(x):  # nor may an export or a compiler see the sizes below
+        return None
+    return 2**18 // width if x.shape[:-1].numel() * width > 2**19 and width <= 2**18 else None
 
 
-def _eager_on_cpu(x: Tensor) -> bool:
+def eager_on_cpu(x: Tensor) -> bool:
+    """Whether each function of ``x`` is a pass over memory of its own: float32 on a CPU, not compiled, no gradients."""
     if torch.is_grad_enabled() or torch.compiler.is_compiling() or torch.compiler.is_exporting():
         return False
     return x.device.type == "cpu" and x.dtype == torch.float32
@@ -222,7 +229,7 @@ class DenoisingMLP(nn.Module):
         every = torch.arange(max(steps) + 1, device=embedding.device)  # no copy from the host, for CUDA graphs
         shift = nn.functional.linear(sinusoidal_embedding(every.float(), self.step_dim).to(dtype), of_time)
         base = nn.functional.linear(embedding.to(dtype), of_embedding, first.bias)
-        rows = rows_at_once(base)
+        rows = rows_at_once(base, base.shape[-1])
         pieces = (base,) if rows is None else base.flatten(0, -2).split(rows)
         if quick_mish_pays(pieces[0]):
             rest = [quick_mish_ if isinstance(layer, nn.Mish) else layer for layer in rest]

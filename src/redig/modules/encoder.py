@@ -6,7 +6,7 @@ import torch
 from torch import Tensor, nn
 from torch_geometric.utils import scatter
 
-from redig.modules.denoiser import ACTIVATIONS
+from redig.modules.denoiser import ACTIVATIONS, eager_on_cpu, rows_at_once
 from redig.modules.neighbours import at_least_float32, radius_edges, within
 
 KINDS = ("edgeconv", "linear")
@@ -130,6 +130,21 @@ class GraphEncoder(nn.Module):
         if not dense:
             rows, states, places = (x.flatten(0, -2) for x in (z, carried, position))
             return self._along_edges(rows, states, places, radius_edges(position, self.radius)).reshape(z.shape)
+        teams = self._teams_at_once(z)
+        if teams is None:
+            return self._along_pairs(z, carried, position)
+        pieces = zip(*(x.flatten(0, -3).split(teams) for x in (z, carried, position)), strict=True)
+        return torch.cat([self._along_pairs(*piece) for piece in pieces]).reshape(z.shape)
+
+    def _teams_at_once(self, z: Tensor) -> int | None:
+        """How many teams of a large batch fit a cache with all their messages; None: take all at once."""
+        if not eager_on_cpu(z):  # an export may not see the number of robots below
+            return None
+        n, width = z.shape[-2], self.embedding_dim if self.kind == "linear" else self.message_out.in_features
+        return rows_at_once(z.flatten(-2), n * max(n - 1, 1) * width)
+
+    def _along_pairs(self, z: Tensor, carried: Tensor, position: Tensor) -> Tensor:
+        """Embeddings ``[*B, n, H]`` from messages between all pairs, those out of range left out."""
         messages, near = self._pairwise_messages(z, carried, position)
         near = near.unsqueeze(-1)
         if self.aggregation == "max":
