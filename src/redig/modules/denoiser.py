@@ -115,7 +115,14 @@ def rows_at_once(x: Tensor, width: int) -> int | None:
 
 
 def eager_on_cpu(x: Tensor) -> bool:
-    """Whether each function of ``x`` is a pass over memory of its own: float32 on a CPU, not compiled, no gradients."""
+    """Whether each function of ``x`` is a pass over memory of its own: float32 on a CPU, not compiled, no gradients.
+
+    Examples:
+        >>> import torch
+        >>> x = torch.zeros(5, 128)
+        >>> eager_on_cpu(x), torch.no_grad()(eager_on_cpu)(x)
+        (False, True)
+    """
     if torch.is_grad_enabled() or torch.compiler.is_compiling() or torch.compiler.is_exporting():
         return False
     return x.device.type == "cpu" and x.dtype == torch.float32
