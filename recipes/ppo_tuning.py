@@ -49,7 +49,7 @@ def row(folder: Path) -> dict[str, Any]:
         evaluations = [numbers(line) for line in csv.DictReader(file)]
     named = {name: config[name] for name in ("formation", "method", "seed")}
     preset = PPOConfig(formation=config["formation"], method=config["method"]).resolve()
-    defaults = asdict(preset)
+    defaults = json.loads(json.dumps(asdict(preset)))  # tuples as lists, as in the file
     changed = [
         f"{name}={value}"
         for name, value in config.items()

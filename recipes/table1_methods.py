@@ -43,7 +43,6 @@ class Method:
 LENIENT = ("--formation-tolerance", "0.5")
 JUMPS = ("--direction-smoothing", "0", *LENIENT)
 SLOWER = ("--demonstration-speed", "0.5", "1", *JUMPS)
-WEDGE, LINE, NOT_LINE = ("wedge",), ("line",), ("circle", "wedge")
 
 # What suits PPO that starts from a clone (docs/results/ppo)
 PPO_CLONED = (
@@ -56,39 +55,15 @@ GAUSSIAN, DETERMINISTIC = ("--actor", "gaussian"), ("--actor", "deterministic")
 METHODS: dict[str, Method] = {
     "redig": Method("ReDiG", "redig_wedge.py"),
     "leader_follower": Method("L&F"),
-    "dgnn": Method("DGNN (PPO)", "ppo_gnn.py", ("--method", "dgnn", *JUMPS)),
-    "afor": Method("AFOR (PPO, spring-damper)", "ppo_gnn.py", ("--method", "afor", *JUMPS)),
-    "afor_redig_reward": Method("AFOR with ReDiG's reward", "ppo_gnn.py", ("--method", "afor_redig_reward", *JUMPS)),
+    "dgnn": Method("DGNN (PPO)", "ppo_gnn.py", ("--method", "dgnn")),
+    "afor": Method("AFOR (PPO, spring-damper)", "ppo_gnn.py", ("--method", "afor")),
+    "afor_redig_reward": Method("AFOR with ReDiG's reward", "ppo_gnn.py", ("--method", "afor_redig_reward")),
     "ppo_cloned": Method("the same, from a clone", "ppo_gnn.py", PPO_CLONED),
-    "redig_coordinated": Method("ReDiG, coordinated demonstrations", "redig_wedge.py", ("--coordinated", *JUMPS)),
+    "redig_coordinated": Method(
+        "ReDiG, coordinated demonstrations, direction that jumps", "redig_wedge.py", ("--coordinated", *JUMPS)
+    ),
     "gaussian": Method("Gaussian actor, trained as ReDiG", "redig_wedge.py", GAUSSIAN),
     "deterministic": Method("deterministic actor, trained as ReDiG", "redig_wedge.py", DETERMINISTIC),
-    "redig_lenient": Method("ReDiG, tolerance 0.5 m", "redig_wedge.py", LENIENT, formations=WEDGE),
-    "ppo_cloned_lenient": Method(
-        "PPO from a clone, tolerance 0.5 m", "ppo_gnn.py", (*PPO_CLONED, *LENIENT), formations=WEDGE
-    ),
-    "redig_jumps": Method("ReDiG, direction that jumps", "redig_wedge.py", JUMPS),
-    "gaussian_jumps": Method(
-        "Gaussian actor, direction that jumps", "redig_wedge.py", (*GAUSSIAN, *JUMPS), formations=LINE
-    ),
-    "deterministic_jumps": Method(
-        "deterministic actor, direction that jumps", "redig_wedge.py", (*DETERMINISTIC, *JUMPS), formations=LINE
-    ),
-    "redig_slower": Method(
-        "ReDiG, slower demonstrations, direction that jumps", "redig_wedge.py", SLOWER, formations=NOT_LINE
-    ),
-    "gaussian_slower": Method(
-        "Gaussian actor, slower demonstrations, direction that jumps",
-        "redig_wedge.py",
-        (*GAUSSIAN, *SLOWER),
-        formations=NOT_LINE,
-    ),
-    "deterministic_slower": Method(
-        "deterministic actor, slower demonstrations, direction that jumps",
-        "redig_wedge.py",
-        (*DETERMINISTIC, *SLOWER),
-        formations=NOT_LINE,
-    ),
     "cloned": Method("ReDiG before online training", of="redig", file="cloned.safetensors"),
     "cloned_coordinated": Method(
         "ReDiG, coordinated, before online training", of="redig_coordinated", file="cloned.safetensors"
@@ -100,15 +75,22 @@ METHODS: dict[str, Method] = {
 SPRING = ("--formation-reward", "spring_damper_bonus")
 
 
-def changed(title: str, *options: str) -> Method:
+def changed(title: str, *options: str, formations: tuple[str, ...] = FORMATIONS) -> Method:
     """The recipe with its earlier defaults and these options."""
-    return Method(title, "redig_wedge.py", (*options, *SLOWER))
+    return Method(title, "redig_wedge.py", (*options, *SLOWER), formations=formations)
 
 
-# Rows of recipes/ablations.py: the recipe with its earlier defaults, and one thing changed
+# Rows of recipes/ablations.py: the defaults, one by one, and the recipe with its earlier ones and one thing changed
 ABLATIONS: dict[str, Method] = {
-    **{name: METHODS[name] for name in ("redig_slower", "redig", "redig_jumps", "redig_coordinated")},
-    **{name: METHODS[name] for name in ("gaussian_slower", "deterministic_slower")},
+    "redig": METHODS["redig"],
+    "redig_lenient": Method("ReDiG, tolerance 0.5 m", "redig_wedge.py", LENIENT, formations=("wedge",)),
+    "redig_jumps": Method("ReDiG, tolerance 0.5 m, direction that jumps", "redig_wedge.py", JUMPS),
+    "redig_slower": changed("ReDiG, all earlier defaults", formations=("circle", "wedge")),
+    "gaussian_slower": changed("Gaussian actor, all earlier defaults", *GAUSSIAN, formations=("circle", "wedge")),
+    "deterministic_slower": changed(
+        "deterministic actor, all earlier defaults", *DETERMINISTIC, formations=("circle", "wedge")
+    ),
+    "coordinated": Method("coordinated demonstrations", "redig_wedge.py", ("--coordinated", *JUMPS)),
     "paper": changed("the paper, as printed", "--paper"),
     "diffusion_spring": changed("diffusion, spring-damper bonus", *SPRING),
     "gaussian_spring": changed("no diffusion, spring-damper bonus", *GAUSSIAN, *SPRING),

@@ -266,7 +266,7 @@ def test_a_trial_is_noted_without_a_final_evaluation(tmp_path, monkeypatch):
         (row,) = csv.DictReader(file)
     assert (row["formation"], row["method"], row["seed"], row["last_updates"]) == ("wedge", "dgnn", "11", "4.0")
     assert {"lr=0.001", "smoke=True", "frames=640"} <= set(row["options"].split())
-    assert "gamma" not in row["options"]
+    assert "gamma" not in row["options"] and "demonstration_speed" not in row["options"]
     assert not list(tmp_path.glob("*/metrics.json"))
     with pytest.raises(ValueError, match="seed: got 0"):
         ppo_tuning.main(PPOConfig(seed=0), out=tmp_path)
