@@ -43,6 +43,7 @@ class Method:
 LENIENT = ("--formation-tolerance", "0.5")
 JUMPS = ("--direction-smoothing", "0", *LENIENT)
 SLOWER = ("--demonstration-speed", "0.5", "1", *JUMPS)
+WEDGE, NOT_LINE = ("wedge",), ("circle", "wedge")
 
 # What suits PPO that starts from a clone (docs/results/ppo)
 PPO_CLONED = (
@@ -83,14 +84,12 @@ def changed(title: str, *options: str, formations: tuple[str, ...] = FORMATIONS)
 # Rows of recipes/ablations.py: the defaults, one by one, and the recipe with its earlier ones and one thing changed
 ABLATIONS: dict[str, Method] = {
     "redig": METHODS["redig"],
-    "redig_lenient": Method("ReDiG, tolerance 0.5 m", "redig_wedge.py", LENIENT, formations=("wedge",)),
+    "redig_lenient": Method("ReDiG, tolerance 0.5 m", "redig_wedge.py", LENIENT, formations=WEDGE),
     "redig_jumps": Method("ReDiG, tolerance 0.5 m, direction that jumps", "redig_wedge.py", JUMPS),
-    "redig_slower": changed("ReDiG, all earlier defaults", formations=("circle", "wedge")),
-    "gaussian_slower": changed("Gaussian actor, all earlier defaults", *GAUSSIAN, formations=("circle", "wedge")),
-    "deterministic_slower": changed(
-        "deterministic actor, all earlier defaults", *DETERMINISTIC, formations=("circle", "wedge")
-    ),
-    "coordinated": Method("coordinated demonstrations", "redig_wedge.py", ("--coordinated", *JUMPS)),
+    "redig_slower": changed("ReDiG, all earlier defaults", formations=NOT_LINE),
+    "gaussian_slower": changed("Gaussian actor, all earlier defaults", *GAUSSIAN, formations=NOT_LINE),
+    "deterministic_slower": changed("deterministic actor, all earlier defaults", *DETERMINISTIC, formations=NOT_LINE),
+    "redig_coordinated": METHODS["redig_coordinated"],
     "paper": changed("the paper, as printed", "--paper"),
     "diffusion_spring": changed("diffusion, spring-damper bonus", *SPRING),
     "gaussian_spring": changed("no diffusion, spring-damper bonus", *GAUSSIAN, *SPRING),
