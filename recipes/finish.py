@@ -18,10 +18,10 @@ TEST_SEED = 2_000_000  # starts of the final evaluation, the same for every trai
 
 
 def score(metrics: dict[str, float]) -> float:
-    """What the best policy has most of: robots and teams that arrive, then formation, then speed, then smoothness.
+    """What the best policy has most of: robots and teams that arrive, then formation and speed, then smoothness.
 
-    Formation and jerk count for the share of robots that arrive, and jerk costs at most 0.5: a team that stands still
-    in perfect formation is worth less than any robot that arrives.
+    A tenth of a second weighs as much as 0.01 of CFI. Formation and jerk count for the share of robots that arrive, and
+    jerk costs at most 0.5: a team that stands still in perfect formation is worth less than any robot that arrives.
     """
     time = metrics["travel_time"] if metrics["travel_time_teams"] > 0 else 20.0
     excess_jerk = min(max(metrics["jerk_mean"] - 2.0, 0.0), 5.0)

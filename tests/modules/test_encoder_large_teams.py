@@ -1,9 +1,12 @@
 """Teams above ``sparse_above``: the same embeddings and gradients, along the edges only."""
 
+import json
 import math
 
 import pytest
 import torch
+from safetensors import safe_open
+from safetensors.torch import load_file, save_file
 from tensordict import TensorDict
 from tensordict.nn import TensorDictModule, TensorDictSequential
 from torchrl.data import Bounded
@@ -11,7 +14,7 @@ from torchrl.data import Bounded
 from redig.modules import DDPM, DenoisingMLP, DiffusionActor, GraphEncoder, QNetwork
 from redig.modules.encoder import AGGREGATIONS
 from redig.objectives import DIPOLoss
-from redig.policy import load_policy
+from redig.policy import PolicyConfig, build_policy, load_policy, save_policy
 
 VARIANTS = [("linear", "sum"), *(("edgeconv", aggregation) for aggregation in AGGREGATIONS)]
 variants = pytest.mark.parametrize(("kind", "aggregation"), VARIANTS)
@@ -148,8 +151,14 @@ def test_export_takes_the_dense_form_for_any_number_of_robots():
         torch.testing.assert_close(exported.module()(state), encoder(state), atol=1e-5, rtol=0)
 
 
-def test_policy_files_from_before_load():
-    policy = load_policy("recipes/policies/wedge.safetensors")
+def test_policy_files_from_before_load(tmp_path):
+    config, path = PolicyConfig(observation_dim=9, edge_features="position"), tmp_path / "policy.safetensors"
+    save_policy(path, build_policy(config), config)
+    header = dict(safe_open(path, framework="pt").metadata())
+    since = {"edge_features", "activation", "sampler", "eta", "kind"}  # the first files say nothing of these
+    header["policy"] = json.dumps({name: value for name, value in vars(config).items() if name not in since})
+    save_file(load_file(path), path, header)
+    policy = load_policy(path)
     encoder = policy[0].module
     assert set(encoder.state_dict()) == {
         f"{name}.{part}"
