@@ -60,9 +60,7 @@ METHODS: dict[str, Method] = {
     "afor": Method("AFOR (PPO, spring-damper)", "ppo_gnn.py", ("--method", "afor")),
     "afor_redig_reward": Method("AFOR with ReDiG's reward", "ppo_gnn.py", ("--method", "afor_redig_reward")),
     "ppo_cloned": Method("the same, from a clone", "ppo_gnn.py", PPO_CLONED),
-    "redig_coordinated": Method(
-        "ReDiG, coordinated demonstrations, direction that jumps", "redig_wedge.py", ("--coordinated", *JUMPS)
-    ),
+    "redig_coordinated": Method("ReDiG, coordinated demonstrations", "redig_wedge.py", ("--coordinated",)),
     "gaussian": Method("Gaussian actor, trained as ReDiG", "redig_wedge.py", GAUSSIAN),
     "deterministic": Method("deterministic actor, trained as ReDiG", "redig_wedge.py", DETERMINISTIC),
     "cloned": Method("ReDiG before online training", of="redig", file="cloned.safetensors"),
@@ -90,6 +88,9 @@ ABLATIONS: dict[str, Method] = {
     "gaussian_slower": changed("Gaussian actor, all earlier defaults", *GAUSSIAN, formations=NOT_LINE),
     "deterministic_slower": changed("deterministic actor, all earlier defaults", *DETERMINISTIC, formations=NOT_LINE),
     "redig_coordinated": METHODS["redig_coordinated"],
+    "coordinated_jumps": Method(
+        "ReDiG, coordinated demonstrations, direction that jumps", "redig_wedge.py", ("--coordinated", *JUMPS)
+    ),
     "paper": changed("the paper, as printed", "--paper"),
     "diffusion_spring": changed("diffusion, spring-damper bonus", *SPRING),
     "gaussian_spring": changed("no diffusion, spring-damper bonus", *GAUSSIAN, *SPRING),
