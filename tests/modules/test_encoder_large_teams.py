@@ -156,7 +156,8 @@ def test_policy_files_from_before_load(tmp_path):
     save_policy(path, build_policy(config), config)
     header = dict(safe_open(path, framework="pt").metadata())
     since = {"edge_features", "activation", "sampler", "eta", "kind"}  # the first files say nothing of these
-    header["policy"] = json.dumps({name: value for name, value in vars(config).items() if name not in since})
+    fields = json.loads(header["policy"]).items()
+    header["policy"] = json.dumps({name: value for name, value in fields if name not in since})
     save_file(load_file(path), path, header)
     policy = load_policy(path)
     encoder = policy[0].module

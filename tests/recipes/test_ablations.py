@@ -23,7 +23,7 @@ def test_each_is_the_default_recipe_with_what_its_options_say_changed(name):
     fields = [field.name for field in dataclasses.fields(Config)]
     changed = {field for field in fields if getattr(given, field) != getattr(DEFAULT, field)}
     named = {option[2:].replace("-", "_").removeprefix("no_") for option in options if option.startswith("--")}
-    preset = {"paper": PAPER, "redig_coordinated": COORDINATED, "coordinated_jumps": COORDINATED}.get(name, {})
+    preset = PAPER if given.paper else COORDINATED if given.coordinated else {}
     assert changed == named | {field for field, value in preset.items() if value != getattr(DEFAULT, field)}
 
 
